@@ -52,7 +52,8 @@ class MaskFolder:
         if not paths:
             found = next((path.name for path in self._by_stem.values()), "no file")
             raise InputError(
-                f"masks: expected masks named like the pictures, {names[0]} to {names[-1]}, found {found} in {self.folder}"
+                f"masks: expected masks named like the pictures, {names[0]} to {names[-1]}, found {found} in "
+                f"{self.folder}"
             )
         if len(paths) < len(names):
             first = next(name for name in names if name not in paths)

@@ -3,7 +3,9 @@
 import importlib.util
 import io
 import json
+from dataclasses import replace
 
+import made_pictures
 import numpy as np
 import pytest
 from made_pictures import BOX, FOCAL, SIZE, before, box_from, earth, poses_around
@@ -18,7 +20,7 @@ from spacesim.data.importers.video import frames as frames_of
 from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
@@ -239,6 +241,26 @@ def test_a_model_is_put_upright_to_scale_and_about_the_object():
     assert report["not_registered"] == ["f"]
     assert report["track_length"] == {"mean": 3.0, "median": 3.0}
     assert draw_cameras(right).shape[2] == 3
+
+
+def test_silhouettes_tell_the_length_where_points_cover_a_part(monkeypatch):
+    """Of a long box, which the cameras must see from the side."""
+    monkeypatch.setattr(made_pictures, "BOX", np.array([1.0, 0.3, 0.3]))
+    poses = np.array(poses_around(12, 120.0))
+    masks = [box_from(pose)[1] for pose in poses]
+    end = BOX * [0.2, 1.0, 1.0] * fibonacci_sphere(200) + [0.8, 0.0, 0.0]
+    model = model_of(end, Rotation.identity(), 1.0, np.zeros(3))
+    model = replace(model, names=tuple(f"{k:02d}" for k in range(12)), world_from_camera=poses)
+    found = hull_length(model, masks)
+    assert found is not None
+    assert found == pytest.approx(2.0, rel=0.1)
+    wrong = [np.zeros_like(masks[0]) if k == 5 else mask for k, mask in enumerate(masks)]
+    assert hull_length(model, wrong) == pytest.approx(found, rel=0.1)
+    by_hull, plain = (placed(model, extent=found, length=length) for length in (2.0, None))
+    away = np.median(np.linalg.norm(model.positions - np.median(end, axis=0), axis=1))
+    np.testing.assert_allclose(by_hull.positions, plain.positions * away * 2 / found, atol=1e-9)
+    one_side = replace(model, names=model.names[:2], world_from_camera=poses[:2])
+    assert hull_length(one_side, masks[:2]) is None
 
 
 def test_points_that_float_are_left_out():

@@ -155,8 +155,8 @@ def _import(
         extent = hull_length(reconstruction, [read_png(folder / "masks" / name) > 0 for name in reconstruction.names])
         if extent is None:
             _log.warning(
-                "length: no camera sees the object's longest axis from the side; taken of the points, which may cover "
-                "a part of it"
+                "length: taken of the points, which may cover a part of the object: its silhouettes show no longest "
+                "axis from the side; name distance where it is known"
             )
     model = placed(without_floating(reconstruction), settings.length, settings.distance, extent)
     if len(model.names) < REGISTERED * len(names):

@@ -16,6 +16,7 @@ _FLOATING = 4.0  # times the median of that distance
 _LEAST_TRACK = 3  # pictures that see a point
 _VOXELS = 64  # along an edge of the cube that silhouettes are cut from
 _WRONG = 0.02  # share of masks, and one besides, that may be wrong at a voxel
+_LONG = 1.5  # times the spread along the next axis: silhouettes from few sides stretch an object that is not long
 _LEAST_SIDE = 45.0  # degrees between the longest axis and a view, from which on its length is known
 
 
@@ -61,7 +62,8 @@ def without_floating(model: SfmModel) -> SfmModel:
 
 def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:
     """Length, in the model's unit, of what the silhouettes enclose (Laurentini, "The visual hull concept", 1994) along
-    its longest axis; None where no camera sees that axis from the side, or silhouettes have no common place.
+    its longest axis (99 % of it); None where no camera sees that axis from the side, where it is not clearly the
+    longest, and where silhouettes have no common place.
 
     masks: [H, W] bool of each picture that has a pose, True where the object is
     """
@@ -98,11 +100,12 @@ def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:
     if len(voxels) < 8:
         return None
     offsets = voxels - voxels.mean(axis=0)
-    axis = np.linalg.eigh(offsets.T @ offsets)[1][:, -1]
+    squares, axes = np.linalg.eigh(offsets.T @ offsets)
+    axis = axes[:, -1]
     rays = normalize(np.array([pose[:3, 3] for pose, _ in views]) - middle)
-    if np.abs(rays @ axis).min() > np.cos(np.radians(_LEAST_SIDE)):
+    if squares[2] < _LONG**2 * squares[1] or np.abs(rays @ axis).min() > np.cos(np.radians(_LEAST_SIDE)):
         return None
-    return float(np.ptp(offsets @ axis) + ticks[1] - ticks[0])
+    return float(np.ptp(np.percentile(offsets @ axis, EXTENT)))
 
 
 def placed(

@@ -304,7 +304,7 @@ def _doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: boo
         for frame in other.frames.values():
             if frame.has_pose():
                 pose = frame.rig_from_world
-                moved = pose.translation + [0.0, 0.0, (factor - 1) * depth]
+                moved = pose.translation + np.array([0.0, 0.0, (factor - 1) * depth])
                 frame.rig_from_world = colmap.Rigid3d(pose.rotation, moved)
         errors.append(_adjust(colmap, other, False, distorted))
     error = float(np.median(model.errors))
