@@ -585,6 +585,7 @@ def test_a_tutorial_runs(path, tmp_path, monkeypatch, capsys):
                 small = words if filmed else smaller(tuple(words))
                 ended = stopped(small) if words[0] in LASTING else call(*small)
                 assert ended.code == 0, (line, ended.errors)
+                said += ended.output
         ran, said = ran + 1, said + capsys.readouterr().out
     assert ran >= 3
     assert PRINTED.get(name_of(path), "") in said
