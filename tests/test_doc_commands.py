@@ -518,7 +518,7 @@ PRINTED = {  # by the blocks of a document, among other things
     "tutorials/first-model.md": "nearest point ",
     "tutorials/relight.md": "unseen_suns {'mean': ",
     "tutorials/torch.md": "after 3 steps",
-    "tutorials/video.md": "17 training and 3 test frames",
+    "tutorials/video.md": "data: 17 frames to train on, 3 to test with",
     "tutorials/compose.md": "composed-small/sheet.png",
 }
 

@@ -62,7 +62,7 @@ def without_floating(model: SfmModel) -> SfmModel:
 
 def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:
     """Length, in the model's unit, of what the silhouettes enclose (Laurentini, "The visual hull concept", 1994) along
-    its longest axis (99 % of it); None where no camera sees that axis from the side, where it is not clearly the
+    its longest axis; None where no camera sees that axis from the side, where it is not clearly the
     longest, and where silhouettes have no common place.
 
     masks: [H, W] bool of each picture that has a pose, True where the object is
@@ -105,7 +105,7 @@ def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:
     rays = normalize(np.array([pose[:3, 3] for pose, _ in views]) - middle)
     if squares[2] < _LONG**2 * squares[1] or np.abs(rays @ axis).min() > np.cos(np.radians(_LEAST_SIDE)):
         return None
-    return float(np.ptp(np.percentile(offsets @ axis, EXTENT)))
+    return float(np.ptp(offsets @ axis))
 
 
 def placed(
