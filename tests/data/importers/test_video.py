@@ -343,3 +343,20 @@ def test_pictures_of_different_things_do_not_fit_together(tmp_path):
         write_png(tmp_path / "in" / f"{k}.png", rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8))
     with pytest.raises(InputError, match=r"in: expected .*too few matches"):
         import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")
+
+
+@needs_colmap
+def test_a_field_of_view_that_pictures_do_not_fix_is_warned_of(tmp_path, caplog):
+    """A far box looks nearly the same from near by a wider lens."""
+    for k, pose in enumerate(poses_around(10, distance=30.0)):
+        write_png(tmp_path / "in" / f"{k:02d}.png", box_from(pose, 6 * FOCAL)[0])
+    import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")
+    said = [record.getMessage() for record in caplog.records if "field of view" in record.getMessage()]
+    assert len(said) == 1
+    assert said[0].endswith("name it with fov")
+    report = json.loads((tmp_path / "out" / "structure.json").read_text())
+    assert report["k1"] == 0  # nothing is made up
+    caplog.clear()
+    fov = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / (6 * FOCAL))))
+    import_dataset("images", tmp_path / "in", tmp_path / "known", masks="none", fov=fov)
+    assert not [record for record in caplog.records if "field of view" in record.getMessage()]
