@@ -18,7 +18,6 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import trimesh
 from test_benchmarks import RUNS
@@ -508,6 +507,7 @@ SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
     "how-to/rigs.md": {"resolution=64": "resolution=16, spp=1"},
     "tutorials/first-model.md": {"256, 256": "24, 24"},
     "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},
+    "tutorials/video.md": {"[480, 270]": "[384, 216]", "views = 40": "views = 20", "--spp 16": "--spp 4"},
     "tutorials/compose.md": {"frames = 48": "frames = 2", "size=128": "size=24"},
 }
 PRINTED = {  # by the blocks of a document, among other things
@@ -518,6 +518,7 @@ PRINTED = {  # by the blocks of a document, among other things
     "tutorials/first-model.md": "nearest point ",
     "tutorials/relight.md": "unseen_suns {'mean': ",
     "tutorials/torch.md": "after 3 steps",
+    "tutorials/video.md": "data: 17 frames to train on, 3 to test with",
     "tutorials/compose.md": "composed-small/sheet.png",
 }
 
@@ -557,18 +558,6 @@ def answering(text: str) -> Iterator[str]:
         yield text.replace("tcp://127.0.0.1:5556", address)
 
 
-def film_of_a_box() -> bytes:
-    """An MP4 file that structure from motion finds the poses of, 24 degrees wide."""
-    from spacesim.splat.export.video import Video
-
-    made = module_of("tests/data/importers/made_pictures.py")
-    video = Video(*made.SIZE, rate=10)
-    focal = 0.5 * made.SIZE[0] / np.tan(np.radians(12))
-    for pose in made.poses_around(12, distance=9.0):
-        video.add(made.box_from(pose, focal)[0])
-    return video.content()
-
-
 @pytest.mark.parametrize("path", TUTORIALS, ids=name_of)
 def test_a_tutorial_runs(path, tmp_path, monkeypatch, capsys):
     """All of its blocks from the top down, in an empty folder: files are written, commands and Python run. They are as
@@ -592,11 +581,11 @@ def test_a_tutorial_runs(path, tmp_path, monkeypatch, capsys):
             for line in filter(None, text.splitlines()):
                 program, *words = shlex.split(line, comments=True)
                 assert program == "spacesim", line
-                if words[:2] == ["import", "video"]:  # so small, the film shows too little to find poses by
-                    Path(words[2]).write_bytes(film_of_a_box())
-                small = smaller(tuple(words))
+                filmed = path.stem == "video" and words[0] == "generate"  # smaller, it shows too little for poses
+                small = words if filmed else smaller(tuple(words))
                 ended = stopped(small) if words[0] in LASTING else call(*small)
                 assert ended.code == 0, (line, ended.errors)
+                said += ended.output
         ran, said = ran + 1, said + capsys.readouterr().out
     assert ran >= 3
     assert PRINTED.get(name_of(path), "") in said

@@ -76,7 +76,11 @@ class MaskFolder:
         names = list(names)
         paths = {name: path for name in names if (path := self.find(name)) is not None}
         if not paths:
-            raise InputError(f"masks: expected masks named like the pictures ({names[0]}), found none in {self.folder}")
+            found = next((path.name for path in self._by_stem.values()), "no file")
+            raise InputError(
+                f"masks: expected masks named like the pictures, {names[0]} to {names[-1]}, found {found} in "
+                f"{self.folder}"
+            )
         if len(paths) < len(names):
             first = next(name for name in names if name not in paths)
             lacking = len(names) - len(paths)

@@ -202,7 +202,7 @@ def test_a_broken_project_ends_in_one_sentence(tmp_path, case):
     [
         ({"images": "nowhere"}, "images: expected a folder, found none at"),
         ({"masks": "nowhere"}, "masks: expected a folder, found none at"),
-        ({"masks": "sparse"}, "masks: expected masks named like the pictures (view 0.png), found none in"),
+        ({"masks": "sparse"}, "masks: expected masks named like the pictures, view 0.png to view 4.png, found"),
         ({"masked": "half"}, "masked: expected one of empty, unknown, found 'half'"),
         ({"mask": "x"}, "mask: expected options of colmap, one of images, masks, masked, found another; did you mean"),
     ],

@@ -3,7 +3,9 @@
 import importlib.util
 import io
 import json
+from dataclasses import replace
 
+import made_pictures
 import numpy as np
 import pytest
 from made_pictures import BOX, FOCAL, SIZE, before, box_from, earth, poses_around
@@ -18,7 +20,7 @@ from spacesim.data.importers.video import frames as frames_of
 from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
@@ -102,7 +104,7 @@ def test_broken_videos_end_in_a_sentence(tmp_path, caplog):
     with pytest.raises(InputError, match=r"none.mp4: expected a video file, found none"):
         next(read_frames(tmp_path / "none.mp4"))
     (tmp_path / "cut.mp4").write_bytes(path.read_bytes()[: path.stat().st_size // 2])  # its index is at the end
-    with pytest.raises(InputError, match=r"cut.mp4: expected a video"):
+    with pytest.raises(InputError, match=r"cut.mp4: expected .* found an MP4 file that is cut off before its index$"):
         list(read_frames(tmp_path / "cut.mp4"))
     with pytest.raises(InputError, match="nothing moves"):
         import_dataset("video", film(tmp_path / "still.mp4", [noise[0]] * 12), tmp_path / "out")
@@ -241,6 +243,26 @@ def test_a_model_is_put_upright_to_scale_and_about_the_object():
     assert draw_cameras(right).shape[2] == 3
 
 
+def test_silhouettes_tell_the_length_where_points_cover_a_part(monkeypatch):
+    """Of a long box, which the cameras must see from the side."""
+    monkeypatch.setattr(made_pictures, "BOX", np.array([1.0, 0.3, 0.3]))
+    poses = np.array(poses_around(12, 120.0))
+    masks = [box_from(pose)[1] for pose in poses]
+    end = BOX * [0.2, 1.0, 1.0] * fibonacci_sphere(200) + [0.8, 0.0, 0.0]
+    model = model_of(end, Rotation.identity(), 1.0, np.zeros(3))
+    model = replace(model, names=tuple(f"{k:02d}" for k in range(12)), world_from_camera=poses)
+    found = hull_length(model, masks)
+    assert found is not None
+    assert found == pytest.approx(2.0, rel=0.1)
+    wrong = [np.zeros_like(masks[0]) if k == 5 else mask for k, mask in enumerate(masks)]
+    assert hull_length(model, wrong) == pytest.approx(found, rel=0.1)
+    by_hull, plain = (placed(model, extent=found, length=length) for length in (2.0, None))
+    away = np.median(np.linalg.norm(model.positions - np.median(end, axis=0), axis=1))
+    np.testing.assert_allclose(by_hull.positions, plain.positions * away * 2 / found, atol=1e-9)
+    one_side = replace(model, names=model.names[:2], world_from_camera=poses[:2])
+    assert hull_length(one_side, masks[:2]) is None
+
+
 def test_points_that_float_are_left_out():
     points = np.concatenate([fibonacci_sphere(500), [[0.0, 0.0, 9.0], [4.0, 4.0, 0.0]]])
     model = model_of(points, Rotation.identity(), 1.0, np.zeros(3))
@@ -321,3 +343,20 @@ def test_pictures_of_different_things_do_not_fit_together(tmp_path):
         write_png(tmp_path / "in" / f"{k}.png", rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8))
     with pytest.raises(InputError, match=r"in: expected .*too few matches"):
         import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")
+
+
+@needs_colmap
+def test_a_field_of_view_that_pictures_do_not_fix_is_warned_of(tmp_path, caplog):
+    """A far box looks nearly the same from near by a wider lens."""
+    for k, pose in enumerate(poses_around(10, distance=30.0)):
+        write_png(tmp_path / "in" / f"{k:02d}.png", box_from(pose, 6 * FOCAL)[0])
+    import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none")
+    said = [record.getMessage() for record in caplog.records if "field of view" in record.getMessage()]
+    assert len(said) == 1
+    assert said[0].endswith("name it with fov")
+    report = json.loads((tmp_path / "out" / "structure.json").read_text())
+    assert report["k1"] == 0  # nothing is made up
+    caplog.clear()
+    fov = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / (6 * FOCAL))))
+    import_dataset("images", tmp_path / "in", tmp_path / "known", masks="none", fov=fov)
+    assert not [record for record in caplog.records if "field of view" in record.getMessage()]

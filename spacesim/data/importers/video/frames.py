@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +52,8 @@ def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
     try:
         container = library.open(str(path))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected a video that FFmpeg reads, found {_reason(error)}") from None
+        found = "an MP4 file that is cut off before its index" if _lacks_index(path) else _reason(error)
+        raise InputError(f"{path}: expected a video that FFmpeg reads, found {found}") from None
     with container:
         if not container.streams.video:
             raise InputError(f"{path}: expected a video, found a file without pictures")
@@ -79,6 +81,21 @@ def read_frames(path: Path, again: bool = False) -> Iterator[FilmFrame]:
             whole = f" of {declared}" if declared else ""
             lost = f"{seconds:.3g} seconds are missing" if seconds else "the rest cannot be decoded"
             _log.warning("%s: breaks off after %d%s frames (%s)", path, count, whole, broken or lost)
+
+
+def _lacks_index(path: Path) -> bool:
+    """Whether a file is of ISO 14496-12's boxes (MP4, MOV), but none of them is a whole `moov`."""
+    size, start, kinds = path.stat().st_size, 0, []
+    with open_regular(path, "a video file") as file:
+        while start + 8 <= size:
+            file.seek(start)
+            length, kind, longer = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
+            start += longer if length == 1 else length or size - start
+            if length in range(2, 8) or (length == 1 and longer < 16):
+                break
+            if start <= size:
+                kinds.append(kind)
+    return kinds[:1] == [b"ftyp"] and b"moov" not in kinds
 
 
 def _lost_seconds(container: Any, end: float | None) -> float:

@@ -31,7 +31,7 @@ from spacesim.data.importers.masks import (
 )
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import (
@@ -166,7 +166,15 @@ def _import(
         reconstruction = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
     except InputError as error:
         raise InputError(str(error).replace(f"{shown.name}: ", f"{src}: ", 1)) from None
-    model = placed(without_floating(reconstruction), settings.length, settings.distance)
+    extent = None
+    if settings.length is not None and has_masks:
+        extent = hull_length(reconstruction, [read_png(folder / "masks" / name) > 0 for name in reconstruction.names])
+        if extent is None:
+            _log.warning(
+                "length: taken of the points, which may cover a part of the object: its silhouettes show no longest "
+                "axis from the side; name distance where it is known"
+            )
+    model = placed(without_floating(reconstruction), settings.length, settings.distance, extent)
     if len(model.names) < REGISTERED * len(names):
         _log.warning(
             "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)",

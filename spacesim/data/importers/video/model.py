@@ -14,6 +14,10 @@ EXTENT = 0.5, 99.5  #: percentiles of points along the longest axis between whic
 _NEIGHBOURS = 8  # of a point, by whose distance it floats or not
 _FLOATING = 4.0  # times the median of that distance
 _LEAST_TRACK = 3  # pictures that see a point
+_VOXELS = 64  # along an edge of the cube that silhouettes are cut from
+_WRONG = 0.02  # share of masks, and one besides, that may be wrong at a voxel
+_LONG = 1.5  # times the spread along the next axis: silhouettes from few sides stretch an object that is not long
+_LEAST_SIDE = 45.0  # degrees between the longest axis and a view, from which on its length is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +60,61 @@ def without_floating(model: SfmModel) -> SfmModel:
     )
 
 
-def placed(model: SfmModel, length: float | None = None, distance: float | None = None) -> SfmModel:
+def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:
+    """Length, in the model's unit, of what the silhouettes enclose (Laurentini, "The visual hull concept", 1994) along
+    its longest axis; None where no camera sees that axis from the side, where it is not clearly the
+    longest, and where silhouettes have no common place.
+
+    masks: [H, W] bool of each picture that has a pose, True where the object is
+    """
+    views = [(pose, mask) for pose, mask in zip(model.world_from_camera, masks, strict=True) if mask.any()]
+    normal, right, angles = np.zeros((3, 3)), np.zeros(3), []
+    for pose, mask in views:  # the point nearest to the rays through the silhouettes' middles
+        columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+        low, high = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]])
+        ray = normalize(pose[:3, :3] @ [*((low + high) / 2 - model.centre) / model.focal, 1.0])
+        across = np.eye(3) - np.outer(ray, ray)
+        normal, right = normal + across, right + across @ pose[:3, 3]
+        angles.append(0.5 * float(np.linalg.norm(high - low)) / model.focal)
+    if len(views) < 2 or np.linalg.cond(normal) > 1e9:
+        return None
+    middle = np.linalg.solve(normal, right)
+    away = np.array([np.linalg.norm(pose[:3, 3] - middle) for pose, _ in views])
+    reach = 1.1 * float(np.max(away * angles))
+    ticks = np.linspace(-reach, reach, _VOXELS)
+    voxels = middle + np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    outside = np.zeros(len(voxels), int)  # of how many silhouettes
+    for pose, mask in views:
+        local = (voxels - pose[:3, 3]) @ pose[:3, :3]
+        flat = local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.inf)
+        flat *= 1 + model.k1 * np.square(flat).sum(axis=1, keepdims=True)
+        pixels = np.floor(model.focal * flat + model.centre)
+        shown = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < mask.shape[::-1]).all(axis=1)
+        columns, rows = pixels[shown].astype(int).T
+        cut_off = mask[[0, -1]].any() or mask[:, [0, -1]].any()  # the object goes on beyond the picture
+        missed = np.full(len(voxels), not cut_off)
+        missed[shown] = ~mask[rows, columns]
+        outside += missed
+        kept = outside <= 1 + _WRONG * len(views)
+        voxels, outside = voxels[kept], outside[kept]
+    if len(voxels) < 8:
+        return None
+    offsets = voxels - voxels.mean(axis=0)
+    squares, axes = np.linalg.eigh(offsets.T @ offsets)
+    axis = axes[:, -1]
+    rays = normalize(np.array([pose[:3, 3] for pose, _ in views]) - middle)
+    if squares[2] < _LONG**2 * squares[1] or np.abs(rays @ axis).min() > np.cos(np.radians(_LEAST_SIDE)):
+        return None
+    return float(np.ptp(offsets @ axis))
+
+
+def placed(
+    model: SfmModel, length: float | None = None, distance: float | None = None, extent: float | None = None
+) -> SfmModel:
     """The model about the origin, z towards where the pictures' upper sides point in the mean, x along the object.
 
-    length: metres of the object along its longest axis: of 99 % of the points
+    length: metres of the object along its longest axis
+    extent: that length in the model's unit; None: of 99 % of the points
     distance: metres from the cameras to the object's middle, the median
     Without either the unit is that median distance. Raises InputError where both are given.
     """
@@ -71,7 +126,7 @@ def placed(model: SfmModel, length: float | None = None, distance: float | None 
     axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
     low, high = np.percentile(offsets @ axis, EXTENT)
     if length is not None:
-        scale = length / (high - low)
+        scale = length / (extent or high - low)
     else:
         scale = (distance or 1.0) / float(np.median(np.linalg.norm(model.positions - middle, axis=1)))
     up = normalize(-model.world_from_camera[:, :3, 1].mean(axis=0))

@@ -5,6 +5,7 @@ that Ctrl-C is heard: it ends them through pycolmap's own token.
 """
 
 import importlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,14 @@ _LEAST_FEATURES, _LEAST_MATCHES = 50, 15
 _FLAT = 0.8  # share of pairs that a homography explains wholly, from which on there is no parallax
 FOCAL = 0.2, 90.0  #: of a camera, in longer sides of its pictures
 _LEAST_ANGLE = 2.0  # degrees: of the median point, from which on its depth is known
+_STRICT = 480  # pixels of the longer side for which a match may be off by one; up to four: all of a small object looks
+# like a plane otherwise
+_SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
+_ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
+_BETTER = 0.95  # share of the error that may be left, for distortion to be believed
+_OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
+
+_log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with the step's name, how much of it is done, and of how much."""
@@ -56,12 +65,15 @@ def reconstruct(
     """Poses of the pictures folder/NAME, all of one camera and of `size` (width, height).
 
     masks: a folder of NAME.png, features are taken where they are not black
-    focal: pixels, where it is known; else it is estimated
+    focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
     ordered: the pictures are in time order
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
     no parallax, less than half of the pictures in one model, an absurd one.
+
+    The lens has no distortion unless that brings in pictures or a twentieth less error: a small object before a black
+    sky says little of it.
     """
     colmap = _library()
     report = progress or (lambda step, done, total: None)
@@ -75,7 +87,8 @@ def reconstruct(
     if focal is not None:
         reader.camera_params = f"{focal},{size[0] / 2},{size[1] / 2},0"
     _find_features(colmap, database, folder, names, reader, report)
-    _match(colmap, database, len(names), ordered, report)
+    strict = min(max(max(size) / _STRICT, 1.0), 4.0)
+    _match(colmap, database, len(names), ordered, strict, report)
     matches = _matches(colmap, database)
     if matches.features < _LEAST_FEATURES:
         raise InputError(
@@ -87,11 +100,19 @@ def reconstruct(
             f"{folder.name}: expected neighbouring pictures to share {_LEAST_MATCHES} matches or more, found "
             f"{matches.pairs} such pairs of {len(names)} pictures: too few matches"
         )
-    models = _map(colmap, database, folder, workspace, focal, len(names), report)
+    find = partial(_map, colmap, database, folder, workspace, focal, strict, len(names), report)
+    models, distorted = find(False), False
+    if _is_bent(colmap, models, len(names), focal is None):
+        others = find(True)
+        if others and (not models or others[0].num_reg_images() >= models[0].num_reg_images()):
+            models, distorted = others, True
+            _adjust(colmap, models[0], focal is None, distorted)
     if not models:
         raise InputError(f"{folder.name}: {_why_none(matches)}")
-    models.sort(key=lambda model: -model.num_reg_images())
-    return _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
+    model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
+    if focal is None:
+        _doubt_focal(colmap, models[0], model, distorted)
+    return model
 
 
 def _library() -> ModuleType:
@@ -156,11 +177,12 @@ def _find_features(
         _run(colmap, lambda token, extract=extract: extract(cancellation_token=token))  # type: ignore[misc]
 
 
-def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, report: Progress) -> None:
+def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, strict: float, report: Progress) -> None:
     options = colmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = 1
     verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.max_error = strict
     verification.ransac.random_seed = SEED
     report("matches", 0, 1)
     shared = {
@@ -203,10 +225,12 @@ def _map(
     folder: Path,
     workspace: Path,
     focal: float | None,
+    strict: float,
     count: int,
     report: Progress,
+    distorted: bool,
 ) -> list[Any]:
-    """Models, empty where none was found."""
+    """Models, the largest first, empty where none was found. strict: pixels that a match may be off"""
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.num_threads = options.mapper.num_threads = 1
@@ -216,15 +240,19 @@ def _map(
     options.mapper.init_min_tri_angle = 8.0  # neighbours in a video see the object from almost one side
     options.mapper.init_min_num_inliers = 50
     options.mapper.abs_pose_min_num_inliers = 20
-    options.ba_refine_focal_length = focal is None
-    options.mapper.abs_pose_refine_focal_length = focal is None
+    options.mapper.init_max_error, options.mapper.abs_pose_max_error = strict, 3 * strict
+    off = max(strict, 2.0)
+    options.mapper.filter_max_reproj_error = off
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = off
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = focal is None
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
     registered = 0
 
     def another() -> None:
         nonlocal registered
         registered += 1
 
-    output = workspace / "models"
+    output = workspace / ("distorted" if distorted else "plain")
     output.mkdir()
     models = _run(
         colmap,
@@ -233,7 +261,60 @@ def _map(
         ),
         lambda: report("poses", min(registered, count), count),
     )
-    return list(models.values())
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
+    """Adjust all of a model but what is known of its lens, by features of which those far off pull little, and return
+    the median error, pixels."""
+    options = colmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.refine_extra_params = focal, distorted
+    options.print_summary = False
+    options.ceres.loss_function_type, options.ceres.loss_function_scale = colmap.LossFunctionType.CAUCHY, _SOFT
+    options.ceres.solver_options.num_threads = 1  # equal results
+    options.ceres.solver_options.function_tolerance = 1e-6
+    which = colmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        which.add_image(number)
+    which.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = colmap.create_default_bundle_adjuster(options, which, model)
+    _run(colmap, lambda token: adjuster.solve())
+    model.update_point_3d_errors()
+    return float(np.median([point.error for point in model.points3D.values()]))
+
+
+def _is_bent(colmap: ModuleType, models: Sequence[Any], count: int, focal: bool) -> bool:
+    """Whether distortion may help: the first model lacks pictures, or fits better with it. It is adjusted without."""
+    if not models:
+        return True
+    plain = _adjust(colmap, models[0], focal, False)
+    return models[0].num_reg_images() < _ENOUGH * count or (
+        _adjust(colmap, colmap.Reconstruction(models[0]), focal, True) < _BETTER * plain
+    )
+
+
+def _doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: bool) -> None:
+    """Log a warning where a longer or a shorter focal length fits nearly as well as the one that was found."""
+    depth = float(np.median([_depths(model, k) for k in range(len(model.names))]))
+    errors = []
+    for factor in (1 / _OTHER_FOCAL, _OTHER_FOCAL):
+        other = colmap.Reconstruction(found)
+        for camera in other.cameras.values():
+            camera.params = [factor * camera.params[0], *camera.params[1:]]
+        for frame in other.frames.values():
+            if frame.has_pose():
+                pose = frame.rig_from_world
+                moved = pose.translation + np.array([0.0, 0.0, (factor - 1) * depth])
+                frame.rig_from_world = colmap.Rigid3d(pose.rotation, moved)
+        errors.append(_adjust(colmap, other, False, distorted))
+    error = float(np.median(model.errors))
+    if min(errors) * _BETTER < error:
+        wide = 2 * np.degrees(np.arctan(0.5 * model.width / model.focal))
+        _log.warning(
+            "the field of view, estimated as %.3g degrees, is uncertain: a focal length %.0f %% %s fits nearly as well "
+            "(%.3g instead of %.3g pixels off); name it with fov",
+            wide, 100 * (_OTHER_FOCAL - 1), "shorter" if errors[0] < errors[1] else "longer", min(errors), error,
+        )  # fmt: skip
 
 
 def _model(model: Any, sizes: list[int]) -> SfmModel:
