@@ -156,7 +156,7 @@ def with_bounce(config: TrainConfig, emitters: int) -> TrainConfig:
 def as_thesis(config: TrainConfig) -> TrainConfig:
     """The field, the shadows and the splats as the thesis has them, in networks of the preset's size."""
     config = with_settings(config, {"light.field.inputs": "directions", "light.bounce": 0})
-    config = replace(config, antialiased=False, supersample=1)
+    config = replace(config, antialiased=False, surfels=False, supersample=1)
     if config.light is None or config.light.shadow is None:
         return config
     printed = preset("thesis", config.method)
@@ -171,10 +171,10 @@ def as_ours(config: TrainConfig) -> TrainConfig:
     if config.preset != "thesis":
         return config
     config = with_settings(config, {"light.field.inputs": "surface"})
-    config = replace(config, antialiased=preset("fast", config.method).antialiased)
+    fast = preset("fast", config.method)
+    config = replace(config, antialiased=fast.antialiased, surfels=fast.surfels)
     if config.light is None or config.light.shadow is None:
         return config
-    fast = preset("fast", config.method)
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
     config = with_bounce(config, light_of(fast).bounce)
     return with_shadow(config, bias=ours.bias, grazing=ours.grazing, method=ours.method, refine=refine)

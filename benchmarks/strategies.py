@@ -9,7 +9,7 @@ training time that refinement takes. Rows:
 
     thesis   default, mesh-aware, support-aware
     field    mcmc
-    ours     default that prunes below an opacity of 0.005 only, with discs, with depth and normals of the truth or of
+    ours     default that prunes below an opacity of 0.005 only, without discs, with depth and normals of the truth or of
              the mesh; other margins and thresholds
     start    support-aware from the mesh, at random in a box of ten times the object's size, and there with a warm start
 
@@ -96,7 +96,7 @@ def configurations(kind: str, options: argparse.Namespace) -> Iterator[tuple[str
         yield "mcmc", made("mcmc", refinement=replace(most, max_gaussians=options.mcmc_gaussians))
     if kind == "ours":
         yield "default, prune_opacity 0.005", made(refinement=replace(made().refinement, prune_opacity=0.005))
-        yield "default, discs", made(flatten_weight=1.0)
+        yield "default, no discs", made(surfels=False)
         yield "default, depth and normals", made(depth_weight=3.0, normal_weight=0.05)
         yield "default, mesh prior", made(depth_weight=3.0, normal_weight=0.05, prior="mesh")
         yield "mesh-aware, narrow margin", with_settings(made("mesh-aware"), {"strategy.exterior_margin": 1e-4})

@@ -217,7 +217,7 @@ _ANY = (
     "--",
 )
 _SETTINGS = (
-    *("views_per_step", "flatten_weight", "antialiased", "supersample", "init_box", "depth_weight", "normal_weight"),
+    *("views_per_step", "surfels", "antialiased", "supersample", "init_box", "depth_weight", "normal_weight"),
     *("prior", "random_background", "light.field.inputs", "light.bounce", "light.linear", "light.tone"),
     *("light.exposure", "light.shadow.bias", "light.shadow.grazing", "light.shadow.method"),
     *("light.shadow.method.filter", "light.shadow.method.sun_radius_deg", "light.shadow.size"),

@@ -41,7 +41,6 @@ WEIGHTS = (
     "isotropy_weight",
     "opacity_weight",
     "scale_weight",
-    "flatten_weight",
     "depth_weight",
     "normal_weight",
 )
@@ -105,7 +104,6 @@ class TrainConfig:
     isotropy_weight: float = 0.0  #: weight: mean distance of the scales from a Gaussian's mean scale, per scene scale
     opacity_weight: float = 0.0  #: weight: mean opacity (`mcmc`)
     scale_weight: float = 0.0  #: weight: mean scale, per scene scale (`mcmc`)
-    flatten_weight: float = 0.0  #: weight: mean shortest scale, per scene scale: Gaussians become discs
     depth_weight: float = 0.0  #: weight: mean error of the depth, per scene scale
     normal_weight: float = 0.0  #: weight: 1 less the cosine between normals
     prior: Literal["truth", "mesh"] = "truth"  #: whose depth and normals these compare with: traced ones, or mesh.ply's
@@ -147,8 +145,6 @@ class TrainConfig:
             raise InputError(f"sun: expected a method that takes the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):
             raise InputError(f"visibility_weight: expected a method with shadows, found {self.method}")
-        if self.surfels and self.flatten_weight > 0:
-            raise InputError(f"flatten_weight: expected 0 beside surfels, which are flat, found {self.flatten_weight}")
         if self.prior == "mesh" and not self.shape_terms:
             expected = "depth_weight or normal_weight above 0, which say how much of it counts"
             raise InputError(f"prior: expected {expected}, found neither")

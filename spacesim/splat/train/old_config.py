@@ -1,4 +1,4 @@
-"""config.json of runs that were trained before the configuration had alternatives: in today's layout."""
+"""config.json of runs that were trained with other fields: in today's layout."""
 
 from collections.abc import Mapping
 
@@ -6,12 +6,13 @@ from spacesim.data.files import JsonDict, JsonMapping
 
 ALIASES = {"park": "baseline-park"}  #: words that methods had: today's
 _STRATEGIES = ("mesh-aware", "support-aware", "mcmc")
+_GONE = ("flatten_weight",)  #: fields that only training read
 
 
 def in_this_layout(values: JsonMapping) -> JsonDict:
     """The fields of a TrainConfig, plain values; those in today's layout stay as they are, and so does what is neither:
     the reader then says what is wrong."""
-    values = dict(values)
+    values = {name: value for name, value in values.items() if name not in _GONE}
     if isinstance(method := values.get("method"), str):
         values["method"] = ALIASES.get(method, method)
     strategies = {name: values.pop(name.replace("-", "_"), {}) for name in _STRATEGIES}

@@ -210,7 +210,6 @@ class Trainer(TrainingLoop):
         weights = {
             "isotropy": config.isotropy_weight / unit,
             "scale": config.scale_weight / unit,
-            "flatten": config.flatten_weight / unit,
             "opacity": config.opacity_weight,
         }
         return {name: dr.opaque(ad.Float, weight / count) for name, weight in weights.items() if weight > 0}

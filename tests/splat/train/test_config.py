@@ -30,10 +30,10 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "694969e5ca852034",
-    "fast": "8ce6f449e35689eb",
-    "fine": "179a8741488ab288",
-    "thesis": "c588f59a16aff066",
+    "demo": "9930604c1963994e",
+    "fast": "79e9a688ee35d032",
+    "fine": "d78f23a42ff3e3e8",
+    "thesis": "e39f448901662cb3",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
 HASHED = (
@@ -49,7 +49,8 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     if config.method in ("vanilla", "baseline-park"):
         return config
     features = 16 if config.preset == "demo" else 32
-    return with_settings(config, {"light.field.features": features, "rates.features_final": config.rates.features})
+    settings = {"light.field.features": features, "rates.features_final": config.rates.features, "surfels": False}
+    return with_settings(config, settings)
 
 
 def thesis_as_it_was(config: TrainConfig) -> TrainConfig:

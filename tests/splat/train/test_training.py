@@ -272,8 +272,6 @@ def test_surfels_stay_discs(small_dataset):
     assert np.ptp(after[:, 1] - after[:, 2]) > 0.01
     for scales in (start, after):
         np.testing.assert_allclose(np.exp(scales[:, 0]), 0.05 * np.exp(scales[:, 1:].min(axis=1)), rtol=1e-5)
-    with pytest.raises(InputError, match="flatten_weight: expected 0 beside surfels"):
-        replace(CONFIG, surfels=True, flatten_weight=1.0)
 
 
 @pytest.mark.parametrize("init", ["points", "random"])

@@ -438,7 +438,7 @@ def test_a_prior_that_nothing_uses_is_a_mistake(spacesim, tiny_data, tmp_path):
     assert spacesim(*line, "--set", "normal_weight=0.1").code == 0
 
 
-# Depth, normals, discs
+# Depth, normals
 
 
 def test_depth_and_normal_loss_by_hand():
@@ -456,9 +456,9 @@ def test_penalties_by_hand():
     gaussians = cloud(np.zeros((2, 3)))
     gaussians.log_scales = ad.Array3f(np.log(np.array([[1, 3], [2, 3], [3, 6]], np.float32)))
     gaussians.logit_opacities = ad.Float([0.0, np.log(3)])
-    for name, expected in (("opacity", [0.5, 0.75]), ("scale", [2, 4]), ("flatten", [1, 3])):
+    for name, expected in (("opacity", [0.5, 0.75]), ("scale", [2, 4])):
         np.testing.assert_allclose(numbers(penalty(name, gaussians)), expected, rtol=1e-6)
-    with pytest.raises(ValueError, match="flatten"):
+    with pytest.raises(ValueError, match="isotropy, opacity or scale"):
         penalty("beauty", gaussians)
 
 
@@ -545,8 +545,6 @@ def test_missing_inputs_of_depth_and_normals_are_refused(small_dataset):
         Trainer(small_dataset, replace(BASE, normal_weight=1.0, prior="mesh"))
     with pytest.raises(InputError, match="prior: expected one of truth, mesh"):
         replace(BASE, prior="rumours")
-    with pytest.raises(InputError, match="flatten_weight"):
-        replace(BASE, flatten_weight=-1.0)
 
 
 @pytest.mark.parametrize(("scale", "shift", "said"), [(1, 1e3, "none sees"), (1e3, 0, "inside of it")])
@@ -572,22 +570,10 @@ def test_methods_of_light_take_them_all(small_lit_dataset):
         depth_weight=0.1,
         normal_weight=0.1,
         visibility_weight=0.1,
-        flatten_weight=0.1,
     )
     trainer = Trainer(small_lit_dataset, config)
     trainer.run(lambda progress: None, lambda: None)
     assert all(np.isfinite(value).all() for value in trainer.gaussians.to_numpy().values())
-
-
-def test_flattened_gaussians_are_discs(small_dataset):
-    config = replace(BASE, init="points", refinement=replace(REFINEMENT, refine_stop=1), init_count=60)
-    shortest = []
-    for weight in (0.0, 1.0):
-        trainer = Trainer(small_dataset, replace(config, flatten_weight=weight))
-        trainer.run(lambda progress: None, lambda: None)
-        scales = np.sort(np.exp(trainer.gaussians.to_numpy()["log_scales"]), axis=1)
-        shortest.append(np.median(scales[:, 0] / scales[:, 2]))
-    assert shortest[1] < 0.8 * shortest[0]
 
 
 def test_the_ball_of_the_tests_has_an_inside(meshed):

@@ -43,19 +43,14 @@ def _where(counts: Bool, error: Float) -> Float:
 def penalty(name: str, gaussians: Gaussians) -> Float:
     """[N] what a named penalty on Gaussians adds up; lengths in metres. The weight of the sum is the caller's.
 
-    "isotropy": see `anisotropy`;  "opacity" and "scale": opacity, and mean scale (Kheradmand et al. 2024);
-    "flatten": the shortest scale, so that Gaussians become discs (Chen et al. 2023, NeuSG)."""
-    scales = dr.exp(gaussians.log_scales)
+    "isotropy": see `anisotropy`;  "opacity" and "scale": opacity, and mean scale (Kheradmand et al. 2024)."""
     if name == "isotropy":
         return anisotropy(gaussians.log_scales)
     if name == "opacity":
         return opacities(gaussians.logit_opacities)
     if name == "scale":
-        return dr.sum(scales) / 3
-    if name == "flatten":
-        first = dr.detach((scales[0] <= scales[1]) & (scales[0] <= scales[2]))
-        return dr.select(first, scales[0], dr.select(dr.detach(scales[1] <= scales[2]), scales[1], scales[2]))
-    raise ValueError(f"name: expected isotropy, opacity, scale or flatten, found {name!r}")
+        return dr.sum(dr.exp(gaussians.log_scales)) / 3
+    raise ValueError(f"name: expected isotropy, opacity or scale, found {name!r}")
 
 
 def anisotropy(log_scales: Array3f) -> Float:

@@ -91,7 +91,7 @@ def test_harmonics_of_higher_degrees_stay_as_they_are():
             np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.parametrize("name", ["isotropy", "opacity", "scale", "flatten"])
+@pytest.mark.parametrize("name", ["isotropy", "opacity", "scale"])
 def test_a_step_does_not_depend_on_what_was_recorded(name):
     """Nor on how many Gaussians there were when it was: training goes on after a pause with the same bits."""
     view, old, found = Pinhole.of(camera(0.8)), Update(False, 1.0), []

@@ -574,7 +574,7 @@ def config_of(strategy: str) -> TrainConfig:
         refinement=refinement,
         opacity_weight=0.01 if strategy == "mcmc" else 0,
         scale_weight=0.01 if strategy == "mcmc" else 0,
-        flatten_weight=0.01,
+        surfels=True,
     )
 
 
