@@ -1,6 +1,7 @@
 """Scenes of trained runs as TOML files (docs/reference/composed-scenes.md): reading them, line by line where they are
 wrong, and writing them."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,6 +28,8 @@ RESOLUTION = (512, 512)  #: pixels
 RULES = Rules(spread=("resolution",))
 
 T = TypeVar("T")
+
+log = logging.getLogger(__name__)
 
 
 def load_scene(
@@ -57,6 +60,8 @@ def load_scene(
     if earth and not composition.knows_earth:
         where = document.label(("earth",))
         raise InputError(f"{where}: expected a model that has learned the Earth's light (light.earth), found none")
+    if earth and (without := [model.name for model in models if not model.run.knows_earth]):
+        log.info("%s: has not learned the Earth's light and is drawn without it", ", ".join(without))
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps, earth)
 
 
@@ -78,7 +83,7 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     if scene.sun is not None:
         values["sun"] = _sun_values(scene.sun)
     earth = (scene.sun and scene.sun.earth) or scene.earth
-    if earth is not None:
+    if earth is not None and scene.composition.knows_earth:
         values["earth"] = _sun_values(Sun(earth.direction))
         values["earth"] |= {"angular_radius_deg": float(earth.angular_radius_deg), "albedo": float(earth.albedo)}
     if scene.camera is not None:
