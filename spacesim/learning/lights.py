@@ -44,7 +44,7 @@ class CanPredict(Protocol):
 def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | None = None) -> tuple[Sun | None, Light]:
     """(the Sun, with the Earth that it lights, whose light is asked for) of what the options `--sun` and `--earth`
     say, degrees. What they do not name is as the frame has it (`of_frame`); sun="none" asks for the Earth's light under
-    the frame's Sun. An Earth that is named is as large and bright as the frame's, else as `Earth` has it.
+    the frame's Sun;  earth: see `named_earth`
 
     Raises InputError where a relightable run gets no Sun, and for the Earth of a run that has not learned its light.
     """
@@ -52,12 +52,7 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
     found = of_frame if sun is None or sun == "none" else Sun.from_angles(*sun)
     if found is None and light == "all" and run.relightable:
         raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
-    if earth is not None and earth != "none":
-        _check_knows_earth(run, "earth")
-    shown = of_frame.earth if of_frame and earth != "none" else None
-    if earth is not None and earth != "none":
-        towards = direction_from_angles(*earth)
-        shown = replace(shown, direction=towards) if shown else Earth(towards)
+    shown = named_earth(run, earth, of_frame.earth if of_frame else None)
     if found is not None:
         found = Sun(found.direction, shown)
     if light == "earth":
@@ -65,6 +60,16 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
         if found is None or shown is None:
             raise InputError("sun: expected AZ,EL where no frame says which Sun lights which Earth, found none")
     return found, light
+
+
+def named_earth(run: CanPredict, earth: Named, of_frame: Earth | None = None) -> Earth | None:
+    """The Earth in a direction, as large and bright as the frame's, else as `Earth` has it; the frame's where none is
+    named. Raises InputError for one that is named for a run that has not learned its light."""
+    if earth is None or earth == "none":
+        return of_frame if earth is None else None
+    _check_knows_earth(run, "earth")
+    towards = direction_from_angles(*earth)
+    return replace(of_frame, direction=towards) if of_frame else Earth(towards)
 
 
 def check_light(run: CanPredict, sun: Sun | None, light: Light) -> None:

@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spacesim.cli.printing import NO_EARTH
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
-from spacesim.data.images import linear_from_srgb
-from spacesim.data.records import Dataset
+from spacesim.data.images import linear_from_srgb, read_png
+from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import load_truth
 from spacesim.learning.lights import added_light
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.serve.draw import PredictedRun
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
@@ -139,6 +141,35 @@ def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
     assert refused.is_refusal("--sun", "no frame says")
 
 
+@pytest.mark.parametrize("form", ["ply", "mesh", "html"])
+def test_exports_have_it_where_it_is_named(spacesim, run, tmp_path, form):
+    """Else a sentence says that it is left out."""
+    sun = () if form == "html" else ("--sun", "20,40")
+    contents = []
+    for number, earth in enumerate([(), ("--earth", "none"), ("--earth", "0,-90")]):
+        out = tmp_path / f"{number}.{form.replace('mesh', 'ply')}"
+        done = spacesim("export", run.path, f"--{form}", out, *sun, *earth)
+        assert done.code == 0, done.errors
+        assert (NO_EARTH in done.errors) == (earth == ())
+        contents.append(out.read_bytes())
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, run, earthlit, tmp_path):
+    options = "--frame", 16, "--frames", 1, "--keep-frames", "--out", tmp_path / "sweep"
+    done = spacesim("sweep", run.path, *options)
+    assert done.code == 0, done.errors
+    frame = earthlit.test[0]
+    sun = Sun(Sun.from_angles(0, 30).direction, frame.sun.earth)
+    (picture,) = (tmp_path / "sweep/frames").iterdir()
+    np.testing.assert_allclose(read_png(picture)[..., :3] / 255, run.predict(frame.camera, sun).rgb, atol=1 / 255)
+
+
+def test_a_served_run_says_that_it_is_left_out(run, caplog):
+    PredictedRun(run)
+    assert f"{run.path} has learned the Earth's light, which is left out" in caplog.text
+
+
 def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
     with pytest.raises(InputError, match=r"earth: expected false or light\.field\.inputs=surface"):
         LightConfig(FieldConfig(), earth=True)
@@ -149,6 +180,10 @@ def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
     for option in (("--earth", "0,0"), ("--sun", "none")):
         done = spacesim("render", blind.path, *option, "--out", tmp_path / "a.png")
         assert done.is_refusal(option[0], "light.earth", blind.path)
+    refused = spacesim("export", blind.path, "--ply", tmp_path / "a.ply", "--sun", "0,0", "--earth", "0,0")
+    assert refused.is_refusal("--earth", "light.earth", blind.path)
+    refused = spacesim("export", blind.path, "--mesh", tmp_path / "a.ply", "--earth", "0,0")
+    assert refused.is_refusal("--earth", "expected with --sun, --html, found without one")
     frame = small_lit_dataset.test[0]
     with pytest.raises(InputError, match=r"light: expected a run that has learned the Earth's light .*, found .*blind"):
         blind.render(frame.camera, frame.sun, light="earth")
