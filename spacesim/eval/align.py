@@ -28,6 +28,7 @@ from spacesim.splat.compose.pose import Pose
 KEY = "source_index"  #: of a frame in transforms.json: which frame of the video it is, from 0
 LEAST = 3  #: matching cameras
 POINTS = 200  #: of the reconstruction that the cameras shall see alike
+FEWEST = 14  #: coordinates in pictures that the move is fitted to, twice its unknowns
 PAIRS = 500  #: of cameras that are tried, at most, to find one without outliers
 OUTLIER = 3.0  #: robust standard deviations
 TOO_FAR = 0.2  #: of the truth's distance: such a residual means that the frames do not match
@@ -176,10 +177,12 @@ def seen_alike(pose: Pose, matches: Sequence[Match], points: Array) -> Pose:
     """
     points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
     own, true = ([pair[side].camera for pair in matches] for side in (0, 1))
-    middle = pose.points(points).mean(axis=0)
-    size = float(np.median([np.linalg.norm(camera.position - middle) for camera in true]))
     seen = places_in_pictures(own, points)
     known = np.isfinite(seen) & np.isfinite(places_in_pictures(true, pose.points(points)))
+    if known.sum() < FEWEST:
+        return pose
+    middle = pose.points(points).mean(axis=0)
+    size = float(np.median([np.linalg.norm(camera.position - middle) for camera in true]))
 
     def moved(steps: Array) -> Pose:
         turn, scale = Rotation.from_rotvec(steps[:3]).as_matrix(), float(np.exp(steps[6]))
@@ -189,8 +192,6 @@ def seen_alike(pose: Pose, matches: Sequence[Match], points: Array) -> Pose:
         off = (places_in_pictures(true, moved(steps).points(points)) - seen)[known]
         return np.nan_to_num(off, nan=1.0)
 
-    if known.sum() < 14:
-        return pose
     return moved(least_squares(apart, np.zeros(7), loss="soft_l1", f_scale=1e-3).x)
 
 
