@@ -9,8 +9,8 @@ training time that refinement takes. Rows:
 
     thesis   default, mesh-aware, support-aware
     field    mcmc
-    ours     default that prunes below an opacity of 0.005 only, without discs, with depth and normals of the truth or of
-             the mesh; other margins and thresholds
+    ours     default that prunes below an opacity of 0.005 only, without discs, with depth and normals of the truth or
+             of the mesh; other margins and thresholds
     start    support-aware from the mesh, at random in a box of ten times the object's size, and there with a warm start
 
 or the names of single rows. What is done already is not done again: an interrupted call goes on where it stopped. Every

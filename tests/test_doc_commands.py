@@ -420,7 +420,7 @@ def given(tiny_data, tmp_path_factory) -> dict[str, Path]:
     """What commands and blocks read: a dataset, one of two boxsats, a run of linear light with shadows, the scene file
     of docs/reference/composed-scenes.md, others."""
     folder = tmp_path_factory.mktemp("given")
-    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--set", "init_count=200"
+    words = "--method", "shadow-map", "--preset", "demo", "--iterations", 8, "--set", "init_count=600"
     small = "--set", "light.linear=true", "--set", "light.shadow.size=16"
     trained = call("train", tiny_data, "--out", folder / "runs/boxsat", *words, *small)
     assert trained.code == 0, trained.errors
