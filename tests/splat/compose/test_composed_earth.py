@@ -119,6 +119,24 @@ def test_a_scene_file_names_it(scene_file, tmp_path):
         assert load_scene(tmp_path / "again.toml").sun_at(0.0).earth == EARTH
 
 
+def test_what_no_model_knows_is_not_saved(tmp_path):
+    save_scene(tmp_path / "scene.toml", PosedScene(GaussianComposition([PlacedRun(made_run("map"), name="one")]), BOTH))
+    text = (tmp_path / "scene.toml").read_text()
+    assert "[sun]" in text
+    assert "[earth]" not in text
+
+
+def test_the_viewer_begins_with_it(scene_file, monkeypatch):
+    load = pytest.importorskip("spacesim.viewer.load")
+    pytest.importorskip("viser", reason="viser is not installed")
+    monkeypatch.setattr(load, "load_scene", load_scene)
+    for text in (SCENE, SCENE.replace("[sun]\nazimuth_deg = 40\nelevation_deg = 35\n", "")):
+        scene_file.write_text(text)
+        setup = load.load_setup(scene_file)
+        assert setup.renderer.knows_earth
+        assert setup.state.sun.earth == EARTH
+
+
 def test_composing_anew_where_it_has_moved(scene_file, tmp_path):
     assert [compose(load_scene(scene_file), tmp_path / "out").rendered for _ in range(2)] == [1, 0]
     assert read_json(tmp_path / "out/shots/0000.json")["earth_direction"] == EARTH.direction.tolist()

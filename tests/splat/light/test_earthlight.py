@@ -9,6 +9,7 @@ import pytest
 from spacesim.cli.printing import NO_EARTH
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
+from spacesim.data.files import read_json
 from spacesim.data.images import linear_from_srgb, read_png
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import load_truth
@@ -139,6 +140,17 @@ def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
         "render", run.path, "--frame", 16, "--earth", "none", "--sun", "none", "--out", tmp_path / "b.png"
     )
     assert refused.is_refusal("--sun", "no frame says")
+
+
+def test_a_scene_is_evaluated_in_the_light_of_its_data(spacesim, run, earthlit, tmp_path):
+    """As the run alone is."""
+    (tmp_path / "scene.toml").write_text(f'[[models]]\nrun = "{run.path}"\n')
+    scores = []
+    for number, what in enumerate([run.path, tmp_path / "scene.toml"]):
+        done = spacesim("eval", what, "--data", earthlit.root, "--out", tmp_path / str(number))
+        assert done.code == 0, done.errors
+        scores.append(read_json(tmp_path / str(number) / "metrics.json")["image"]["psnr"]["mean"])
+    assert scores[0] == scores[1]
 
 
 @pytest.mark.parametrize("form", ["ply", "mesh", "html"])
