@@ -40,7 +40,8 @@ from spacesim.splat.train.trainer import Trainer
 try:
     import gsplat
     import torch
-    from support.peer_gsplat import Tensors, rasterize, similarity_of
+    from support.peer_gsplat import rasterize
+    from support.peer_torch import Tensors, similarity_of
 except ImportError as error:
     MISSING: ImportError | None = error
 else:
@@ -228,7 +229,8 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
         target = rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]) * below
         picture = image + (1 - alpha) * below
         l1 = (picture - target).abs().mean()
-        loss = (1 - config.ssim_weight) * l1 + config.ssim_weight * (1 - similarity_of(picture, target))
+        similarity = similarity_of(picture.permute(2, 0, 1), target.permute(2, 0, 1))
+        loss = (1 - config.ssim_weight) * l1 + config.ssim_weight * (1 - similarity)
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()

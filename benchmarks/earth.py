@@ -24,7 +24,7 @@ from spacesim.data.images.tone import STANDARD_EXPOSURE, display_values
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import load_truth
 from spacesim.eval.metrics.image import psnr
-from spacesim.learning.prediction import added_light
+from spacesim.learning.lights import added_light
 from spacesim.progress import show_progress
 from spacesim.reproduce.perform import trained
 from spacesim.scenes import generate, read_scene
@@ -79,7 +79,7 @@ def layers_of(run: Run, data: Dataset, frame: Frame) -> tuple[float, ...]:
     assert frame.sun is not None
     assert truth.radiance_earth is not None
     both, sun = (run.predict(frame.camera, light) for light in (frame.sun, replace(frame.sun, earth=None)))
-    shown = both.rgb, sun.rgb, added_light(both, sun, "srgb").rgb
+    shown = both.rgb, sun.rgb, added_light(both, sun).rgb
     traced = truth.radiance, truth.radiance - truth.radiance_earth, truth.radiance_earth
     surface = truth.object_id > 0
     pictures = [display_values(np.clip(STANDARD_EXPOSURE * layer, 0, 1), "srgb") for layer in traced]

@@ -1,6 +1,6 @@
 """How fast one frame is binned, blended and differentiated, and how that grows.
 
-    python benchmarks/rasterizer.py [--sizes 31622x1024,165495x1024] [--peers gsplat] [--markdown] [--json FILE]
+    python benchmarks/rasterizer.py [--sizes 31622x1024,165495x1024] [--peers gsplat,fastergs] [--markdown]
     python benchmarks/rasterizer.py --growth [--plot growth.svg]
 
 The scene is a sphere of random splats that fills most of the picture, spherical harmonics of degree 3. Two times are
@@ -11,8 +11,10 @@ profiler. "frame" is parameters to picture without gradients; forward and backwa
 and splat, and draws it with `--plot`.
 """
 
+import argparse
 import importlib
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +22,33 @@ from support import common, growth
 from support.pipeline import Pipeline, arguments_of
 
 from spacesim import backend
+from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 
 STAGES = ("project", "bin", "forward", "backward", "frame")
 DIRECTION = 4, 1, 1  #: of the camera from the sphere
 SHARED = ("bin", "forward", "backward")  #: what is compared with gsplat's kernels
+PEERS = ("gsplat", "fastergs")
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024,1000000x1024", "llvm": "10000x256,30000x256,30000x512"}
 
 
 def main() -> None:
     parser = common.arguments(__doc__)
-    parser.add_argument("--peers", choices=["gsplat"], help="measured in turn with ours; needs CUDA, torch, gsplat")
+    add_peers_option(parser)
     parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="draw time against pairs")
     options = parser.parse_args()
     name = backend.select(options.backend)
     sizes = common.parse_sizes(options.sizes or (growth.SIZES if options.growth else SIZES)[name])
-    peer = load_peer(options.peers, name)
-    results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]
-    if peer is not None:  # once all clocks are read: a profiler that was attached slows launches down
-        for result in results:
-            add_peer_kernels(result, peer)
+    peers = load_peers(options.peers, name)
+    results = [measure(count, pixels, options.repeats, peers) for count, pixels in sizes]
+    for result in results if peers else []:  # once all clocks are read: an attached profiler slows launches down
+        add_peer_kernels(result, peers)
     report: dict[str, Any] = {"rows": results}
     tables = {
         "On the clock, ms: median": [clock_row(r) for r in results],
         "Kernels, ms": [kernel_row(r) for r in results],
-        "Beside gsplat, ms (ratio: ours / gsplat's)": [peer_row(r) for r in results if "gsplat" in r],
+        "Beside peers, ms (ratio: ours / theirs)": [peer_row(r, name) for r in results for name in r["peers"]],
     }
     if options.growth or options.plot:
         points = [growth.Point(r["gaussians"], r["pixels"], r["pairs"], r["least kernels"]) for r in results]
@@ -56,7 +59,24 @@ def main() -> None:
         write_bytes(options.plot, growth.plot("project + bin + forward + backward, kernels", points).encode())
 
 
-def load_peer(wanted: str | None, name: str, module: str = "support.peer_gsplat") -> Any:
+def add_peers_option(parser: argparse.ArgumentParser) -> None:
+    """`--peers`, for `load_peers`."""
+    parser.add_argument(
+        "--peers", default="", help=f"of {', '.join(PEERS)}, commas between: measured in turn with ours"
+    )
+
+
+def load_peers(wanted: str, name: str) -> dict[str, Any]:
+    """The modules by their names, without those that cannot be measured here. Raises InputError for no such peer."""
+    names = [peer for peer in wanted.split(",") if peer]
+    unknown = [peer for peer in names if peer not in PEERS]
+    if unknown:
+        raise InputError(f"--peers: expected some of {', '.join(PEERS)}, found {unknown[0]!r}")
+    modules = {peer: load_peer(peer, name, f"support.peer_{peer}") for peer in names}
+    return {peer: module for peer, module in modules.items() if module is not None}
+
+
+def load_peer(wanted: str | None, name: str, module: str) -> Any:
     """The module, or None with a line that says why it is not measured."""
     if wanted is None:
         return None
@@ -69,19 +89,17 @@ def load_peer(wanted: str | None, name: str, module: str = "support.peer_gsplat"
         return None
 
 
-def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
-    """Times of the stages for `count` Gaussians on pixels x pixels, and of the peer's in turn with them."""
+def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> dict[str, Any]:
+    """Times of the stages for `count` Gaussians on pixels x pixels, and of the peers' in turn with them."""
     arrays, camera = common.sphere_arrays(count), common.camera_from(DIRECTION, pixels)
     ours = Pipeline(arrays, camera)
     works = {stage: getattr(ours, stage) for stage in STAGES}
-    theirs: dict[str, Any] = {}
-    if peer is not None:
-        frame = peer.Frame(arrays, camera)
-        theirs = {"frame": frame.whole} | {stage: getattr(frame, stage) for stage in SHARED}
+    frames = {name: peer.Frame(arrays, camera) for name, peer in peers.items()}
+    theirs = {name: stages_of(frame) for name, frame in frames.items()}
     times: dict[str, common.Timing] = {}
-    for stage, work in works.items():  # a stage of ours in turn with the same stage of the peer's
-        turn = {stage: work} | ({f"gsplat {stage}": theirs[stage]} if stage in theirs else {})
-        times |= common.interleaved(turn, repeats)
+    for stage, work in works.items():  # a stage of ours in turn with the same stage of the peers'
+        turn = {f"{name} {stage}": stages[stage] for name, stages in theirs.items() if stage in stages}
+        times |= common.interleaved({stage: work, **turn}, repeats)
     kernels = common.kernels_in_turn(works)
     sums = {stage: kernel.milliseconds for stage, kernel in kernels.items()}
     result: dict[str, Any] = {"gaussians": count, "pixels": pixels, **arguments_of(ours)}
@@ -89,33 +107,40 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
     result["kernels"] = sums | {"sum": sum(sums[stage] for stage in STAGES if stage != "frame")}
     result["least kernels"] = sum(kernels[stage].least for stage in STAGES if stage != "frame")
     result["launches"] = {stage: kernel.launches for stage, kernel in kernels.items()}
-    if theirs:
-        clock = {stage: times[f"gsplat {stage}"] for stage in theirs}
-        result["gsplat"] = {"pairs": frame.pairs, "clock": clock}
+    result["peers"] = {
+        name: {"pairs": frame.pairs, "clock": {stage: times[f"{name} {stage}"] for stage in theirs[name]}}
+        for name, frame in frames.items()
+    }
     return result
 
 
-def add_peer_kernels(result: dict[str, Any], peer: Any) -> None:
-    """What gsplat's kernels need for what `result` has measured on the clock, and the ratios of both."""
-    frame = peer.Frame(common.sphere_arrays(result["gaussians"]), common.camera_from(DIRECTION, result["pixels"]))
-    works = {"frame": frame.whole} | {stage: getattr(frame, stage) for stage in SHARED}
-    result["gsplat"]["kernels"] = {stage: peer.device_milliseconds(work) for stage, work in works.items()}
-    result["ratios"] = ratios(result)
+def stages_of(frame: Any) -> dict[str, Any]:
+    """What a peer's frame has of our stages."""
+    return {"frame": frame.whole} | {stage: getattr(frame, stage) for stage in SHARED if hasattr(frame, stage)}
 
 
-def ratios(result: dict[str, Any]) -> dict[str, float | None]:
-    """Ours over gsplat's: a frame on the clock and by kernels; binning, forward and backward likewise."""
-    ours, theirs = result, result["gsplat"]
-    quotients: dict[str, float | None] = {
-        "frame, clock": ours["clock"]["frame"].median / theirs["clock"]["frame"].median,
-        "bin + forward + backward, clock": sum(ours["clock"][s].median for s in SHARED)
-        / sum(theirs["clock"][s].median for s in SHARED),
-    }
-    device = theirs["kernels"]
-    if None not in device.values():
-        quotients["frame, kernels"] = ours["kernels"]["frame"] / device["frame"]
-        sums = sum(ours["kernels"][s] for s in SHARED), sum(device[s] for s in SHARED)
-        quotients["bin + forward + backward, kernels"] = sums[0] / sums[1]
+def add_peer_kernels(result: dict[str, Any], peers: Mapping[str, Any]) -> None:
+    """What the peers' kernels need for what `result` has measured on the clock, and the ratios of both."""
+    from support.peer_torch import device_milliseconds
+
+    for name, peer in peers.items():
+        frame = peer.Frame(common.sphere_arrays(result["gaussians"]), common.camera_from(DIRECTION, result["pixels"]))
+        theirs = result["peers"][name]
+        theirs["kernels"] = {stage: device_milliseconds(work) for stage, work in stages_of(frame).items()}
+        theirs["ratios"] = ratios(result, theirs)
+
+
+def ratios(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, float]:
+    """Ours over a peer's: a frame on the clock and by kernels; binning, forward and backward likewise."""
+    quotients: dict[str, float] = {}
+    for name, stages in (("frame", ("frame",)), ("bin + forward + backward", SHARED)):
+        if not theirs["clock"].keys() >= set(stages):
+            continue
+        clocks = (sum(one["clock"][stage].median for stage in stages) for one in (ours, theirs))
+        quotients[f"{name}, clock"] = next(clocks) / next(clocks)
+        if None not in theirs["kernels"].values():
+            kernels = (sum(one["kernels"][stage] for stage in stages) for one in (ours, theirs))
+            quotients[f"{name}, kernels"] = next(kernels) / next(kernels)
     return quotients
 
 
@@ -132,19 +157,15 @@ def kernel_row(result: dict[str, Any]) -> common.Row:
     return row | {"frame": result["kernels"]["frame"]}
 
 
-def peer_row(result: dict[str, Any]) -> common.Row:
-    """A frame on the clock, then the kernels of the stages, each ours / gsplat's."""
-    theirs = result["gsplat"]
-    row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"]}
+def peer_row(result: dict[str, Any], name: str) -> common.Row:
+    """A frame on the clock, then the kernels of the stages, each ours / the peer's, and the ratios."""
+    theirs = result["peers"][name]
+    row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"], "peer": name}
     row["frame"] = f"{result['clock']['frame']} / {theirs['clock']['frame']}"
-    row["frame, ratio"] = result["ratios"]["frame, clock"]
-    for stage in (*SHARED, "frame"):
-        other = theirs["kernels"][stage]
+    for stage, other in theirs["kernels"].items():
         text = "-" if other is None else f"{other:.2f}"
         row[f"{stage}, kernels"] = f"{result['kernels'][stage]:.2f} / {text}"
-    row["b + f + b, kernels, ratio"] = result["ratios"].get("bin + forward + backward, kernels", "-")
-    row["b + f + b, clock, ratio"] = result["ratios"]["bin + forward + backward, clock"]
-    return row
+    return row | {f"{what}, ratio": ratio for what, ratio in theirs["ratios"].items()}
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How long a training step takes, beside gsplat or OpenSplat; where its time goes; what it holds and records.
 
-    python benchmarks/training.py [--sizes 31622x1024] [--peers gsplat] [--opensplat PATH] [--markdown] [--json FILE]
+    python benchmarks/training.py [--sizes 31622x1024] [--peers gsplat,fastergs] [--opensplat PATH] [--markdown]
     python benchmarks/training.py --growth [--plot step.svg]
     python benchmarks/training.py --profile [--sizes 31622x1024]
     python benchmarks/training.py --memory
@@ -8,20 +8,22 @@
 
 A step is the trainer's own: rasterization with spherical harmonics of degree 3, L1 + D-SSIM, gradients,
 Adam over all parameters, statistics; refinement is off and step sizes are 1e-12, so that every step has the same work.
-Ours and the peer's take turns; medians and quartiles after warm-up. gsplat's step is its rasterizer, SSIM by torch's
-conv2d (and by fused_ssim where that is installed), torch's Adam (plain and fused), its pictures on the device already.
-OpenSplat is a binary given by path, run on the same pictures from the same points, as ours in that row.
+Ours and the peers' take turns, 20 steps in a row each, as in training; medians and quartiles of a step after warm-up.
+gsplat's is its rasterizer, SSIM by torch's conv2d (and by fused_ssim where that is installed), torch's Adam (plain and
+fused); Faster-GS's its rasterizer, fused_ssim and its Adam; their pictures are on the device already. OpenSplat is a
+binary given by path, run on the same pictures from the same points, as ours in that row.
 
 `--profile`: time of each stage's kernels beside the physical floor. `--memory`: bytes a Gaussian, by Dr.Jit's own
 count of what it has allocated at most. `--steps N`: training with refinement; recordings, kernels, memory at ten marks.
 """
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rasterizer import load_peer
+import numpy as np
+from rasterizer import add_peers_option, load_peers
 from support import common, counters, floors, growth, peer_opensplat
 from support.pipeline import SSIM_WEIGHT, Pipeline
 from support.synthetic import NEVER, STILL, still_trainer, write_dataset
@@ -35,12 +37,13 @@ MEMORY_SIZES = "16384x64,16385x64,20000x64,21846x64,30000x64,32769x64,43691x64,6
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
 ROUNDS = 3  #: of ours and OpenSplat in turn
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
+IN_A_ROW = 20  #: steps that are timed together
 RATES = dict.fromkeys(("means", "log_scales", "quaternions", "logit_opacities", "sh0", "shN"), STILL.means)
 
 
 def main() -> None:
     parser = common.arguments(__doc__)
-    parser.add_argument("--peers", choices=["gsplat"], help="measured in turn with ours; needs CUDA, torch, gsplat")
+    add_peers_option(parser)
     parser.add_argument("--opensplat", type=Path, metavar="PATH", help="OpenSplat's binary, run on the CPU")
     parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="draw time against pairs")
@@ -64,8 +67,8 @@ def main() -> None:
     if options.profile:
         report, tables = floors.profiles(sizes, options.repeats)
         return common.emit(report, tables, options)
-    peer = load_peer(options.peers, name)
-    results = [measure(count, pixels, options.repeats, peer) for count, pixels in sizes]
+    peers = load_peers(options.peers, name)
+    results = [measure(count, pixels, options.repeats, peers) for count, pixels in sizes]
     report = {"rows": results}
     tables = {"A training step, ms: median (quartiles)": [row for result in results for row in describe(result)]}
     if options.opensplat or (name == "llvm" and not options.growth):
@@ -81,23 +84,20 @@ def main() -> None:
         write_bytes(options.plot, growth.plot("training step on the clock", points).encode())
 
 
-def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
-    """Times of a step of ours and of the peer's ways to make one."""
+def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> dict[str, Any]:
+    """Times of a step of ours and of the peers' ways to make one."""
     arrays = common.sphere_arrays(count)
     with tempfile.TemporaryDirectory() as folder:
         dataset = write_dataset(Path(folder) / "data", count, pixels)
         trainer = still_trainer(dataset, count, arrays)
         works: dict[str, Callable[[], Any]] = {"spacesim": trainer.step}
-        if peer is not None:
-            views = [(frame.camera, load_image(dataset, frame).rgb) for frame in dataset.train]
-            for ssim, fused in [
-                ("torch", False),
-                ("torch", True),
-                *([("fused_ssim", True)] if has_fused_ssim() else []),
-            ]:
-                label = f"gsplat, SSIM by {ssim}, Adam {'fused' if fused else 'plain'}"
-                works[label] = peer.Step(arrays, views, RATES, SSIM_WEIGHT, ssim, fused)
-        times = common.interleaved(works, repeats, WARM_UP)
+        views = [(frame.camera, load_image(dataset, frame).rgb) for frame in dataset.train] if peers else []
+        for name, peer in peers.items():
+            steps = peer.steps((arrays, views, RATES, SSIM_WEIGHT))
+            works |= {f"{name}, {label}": step for label, step in steps.items()}
+        rows = {label: in_a_row(step) for label, step in works.items()}
+        seconds = common.seconds(rows, repeats, -(-WARM_UP // IN_A_ROW))
+        times = {label: common.Timing.of(np.array(some) / IN_A_ROW) for label, some in seconds.items()}
         kernels = common.kernels(trainer.step)
     if trainer.gaussians.count != count or trainer.iteration >= NEVER:
         raise AssertionError("a step of the benchmark has refined")
@@ -106,6 +106,16 @@ def measure(count: int, pixels: int, repeats: int, peer: Any) -> dict[str, Any]:
     result |= {"kernels": kernels.milliseconds, "launches": kernels.launches}
     result["ratios"] = {k: times["spacesim"].median / t.median for k, t in times.items() if k != "spacesim"}
     return result
+
+
+def in_a_row(step: Callable[[], Any]) -> Callable[[], None]:
+    """So many steps."""
+
+    def steps() -> None:
+        for _ in range(IN_A_ROW):
+            step()
+
+    return steps
 
 
 def describe(result: dict[str, Any]) -> list[common.Row]:
@@ -135,14 +145,6 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
         return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
     peer = common.Timing.of(peer_opensplat.seconds_a_step(pairs))
     return row | {"OpenSplat": peer, "ours / theirs": row["spacesim"].median / peer.median}
-
-
-def has_fused_ssim() -> bool:
-    try:
-        import fused_ssim  # noqa: F401
-    except ImportError:
-        return False
-    return True
 
 
 if __name__ == "__main__":

@@ -3,17 +3,20 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spacesim import backend, interrupts
-from spacesim.cli.parser import Parser, angles
-from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE, WANTS_FILTER
+from spacesim.cli.parser import Parser, angles, angles_or_none
+from spacesim.cli.printing import KNOWS_ONE_LIGHT, NO_EARTH, RELATIVE, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.integrity.manifest import check_unlisted
 
 if TYPE_CHECKING:
+    from spacesim.data.earth import Earth
+    from spacesim.learning.lights import CanPredict
     from spacesim.splat.export.splats import Form
 
 SUMMARY, NEEDS_BACKEND = "a run or a dataset as files for other tools", False
@@ -49,6 +52,8 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
         metavar="AZ,EL",
         help="for a relightable run: whose colours Gaussians or --mesh have (--mesh: albedo)",
     )
+    of_earth = "with --sun and for --html: where the Earth is, for a run that has learned its light (none)"
+    parser.add_argument("--earth", type=angles_or_none, metavar="AZ,EL|none", help=of_earth)
     parser.add_argument(
         "--up", metavar="z|y|-y", help="the file's axis that the dataset's +z becomes (y in glTF and SPZ)"
     )
@@ -74,6 +79,8 @@ def run(options: argparse.Namespace) -> None:
         for name, given in (("sun", options.sun), ("up", options.up), ("scale", options.scale)):
             _check_absent(name, given, (*SPLATS, "mesh"))
         _check_absent("recentre", options.recentre or None, (*SPLATS, "mesh"))
+    if options.html is None and options.sun is None:
+        _check_absent("earth", options.earth, ("sun", "html"))
     if splats != "spz":
         _check_absent("spz_version", options.spz_version, ("spz",))
     labels = next((name for name in LABELS if getattr(options, name) is not None), None)
@@ -124,7 +131,8 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     if options.sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     if run.light is not None:
-        model = bake(model, run.light, Sun.from_angles(*options.sun).direction if options.sun else None)
+        sun = Sun.from_angles(*options.sun).direction if options.sun else None
+        model = bake(model, run.light, sun, earth=_earth(options, run))
     write_splats(model, out, form, frame, run.antialiased, options.spz_version or 3)
     if run.antialiased and form != "spz":  # which records it
         print(WANTS_FILTER, file=sys.stderr)
@@ -171,7 +179,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
         surface = mesh_of_depths(depth, cameras, config, report)
     if len(surface.faces) == 0:
         raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
-    sun = Sun.from_angles(*options.sun) if options.sun else None
+    sun = replace(Sun.from_angles(*options.sun), earth=_earth(options, run)) if options.sun else None
     colors, roughness = None, None
     if sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
@@ -212,9 +220,18 @@ def _export_html(options: argparse.Namespace) -> None:
     if run is None:
         raise InputError(f"html: expected a run of Gaussians, found {options.path}, a radiance field")
     with show_progress("export", "steps") as report:
-        write_page(run, options.html, report)
+        write_page(run, options.html, report, _earth(options, run))
     size = options.html.stat().st_size / 1e6
     interrupts.print_output(f"{options.html}: {run.gaussian_count} Gaussians, {size:.1f} MB")
+
+
+def _earth(options: argparse.Namespace, run: "CanPredict") -> "Earth | None":
+    """That `--earth` names; where a run has learned its light and nothing is said, a sentence that it is left out."""
+    from spacesim.learning.lights import named_earth
+
+    if run.knows_earth and options.earth is None:
+        print(NO_EARTH, file=sys.stderr)
+    return named_earth(run, options.earth)
 
 
 def _export_labels(options: argparse.Namespace, kind: str) -> None:

@@ -6,6 +6,7 @@ from spacesim import interrupts
 from spacesim.data.files import JsonDict
 
 KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun changes nothing"
+NO_EARTH = "the run has learned the Earth's light, which is left out; --earth AZ,EL adds it"
 WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 RELATIVE = "the data that says how bright the Sun was is not there: albedo is relative, to a Sun at 1 au and 0 EV"
 

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from spacesim import interrupts
@@ -33,7 +34,9 @@ def run(options: argparse.Namespace) -> None:
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
-    camera, _ = view_of(options, run)
+    camera, of_frame = view_of(options, run)
+    if of_frame is not None and run.knows_earth:
+        suns = [replace(sun, earth=of_frame.earth) for sun in suns]
     if options.size is not None:
         camera = resize_camera(camera, options.size)
     with show_progress("sweep", "frames") as report:

@@ -34,6 +34,16 @@ class Earth:
         expect(0 <= self.albedo <= 1, "earth_albedo", "a fraction from 0 to 1", self.albedo)
         object.__setattr__(self, "direction", normalize(direction))
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Earth) and self._numbers == other._numbers
+
+    def __hash__(self) -> int:
+        return hash(self._numbers)
+
+    @property
+    def _numbers(self) -> tuple[float, ...]:
+        return *self.direction.tolist(), self.angular_radius_deg, self.albedo
+
     def beams(self, sun: Array) -> Array:
         """[BEAMS, 4]: the Earth's light under the Sun in the unit direction `sun` [3] as parallel beams, each a unit
         vector towards its part of the disc and its irradiance at normal incidence, where sunlight has 1.

@@ -37,7 +37,8 @@ def check_size(width: int, height: int, name: str) -> None:
 def planes_repr(record: object, width: int, height: int) -> str:
     """The `repr` of a dataclass of planes: their size and which of them are there, not their numbers."""
     cls: Any = type(record)
-    names = [f.name for f in fields(cls) if f.name not in ("width", "height") and getattr(record, f.name) is not None]
+    values = {field.name: getattr(record, field.name) for field in fields(cls)}
+    names = [name for name, value in values.items() if not isinstance(value, int | str | None)]
     return f"{cls.__name__}({width} x {height} pixels: {', '.join(names)})"
 
 

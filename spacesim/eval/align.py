@@ -1,5 +1,5 @@
 """A reconstruction in axes and a scale of its own, as structure from motion makes it, brought into the truth's: the
-similarity (Umeyama 1991) between cameras that both datasets have.
+similarity (Umeyama 1991) between cameras that both datasets have, then that by which they see the points alike.
 
 Frames are matched by the key `source_index` of transforms.json where both name it, else by the stem of the picture's
 file, else, where one side alone names it, by counting the other's frames in the order of their file paths from 0: a
@@ -7,23 +7,28 @@ video's frames were taken one after another.
 """
 
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from spacesim.data.density import target_of
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
 from spacesim.data.geometry import Array, quaternion_from_rotation
-from spacesim.data.records import Dataset, Frame
+from spacesim.data.records import Camera, Dataset, Frame
+from spacesim.data.store import read_points
 from spacesim.splat.compose.aligned import moved_frame
 from spacesim.splat.compose.pose import Pose
 
 KEY = "source_index"  #: of a frame in transforms.json: which frame of the video it is, from 0
 LEAST = 3  #: matching cameras
+POINTS = 200  #: of the reconstruction that the cameras shall see alike
+FEWEST = 14  #: coordinates in pictures that the move is fitted to, twice its unknowns
 PAIRS = 500  #: of cameras that are tried, at most, to find one without outliers
 OUTLIER = 3.0  #: robust standard deviations
 TOO_FAR = 0.2  #: of the truth's distance: such a residual means that the frames do not match
@@ -68,8 +73,8 @@ class Alignment:
 
 
 def align(own: Dataset, truth: Dataset) -> Alignment:
-    """The pose of what was trained on `own` in the world of `truth`. Raises InputError where too few frames match or
-    their cameras do not."""
+    """The pose of what was trained on `own` in the world of `truth`: by cameras, and `seen_alike` if it has points.
+    Raises InputError where too few frames match or their cameras do not."""
     matches, words = match_frames(own, truth)
     if len(matches) < LEAST:
         raise InputError(
@@ -86,6 +91,10 @@ def align(own: Dataset, truth: Dataset) -> Alignment:
             f"{own.root}: expected cameras like those of {truth.root}, found {is_inlier.sum()} of {len(matches)} "
             f"within {100 * rms / distance:.0f} % of the distance (matched by {words}; a mirrored model never fits)"
         )
+    if own.ply_file_path is not None:
+        pose = seen_alike(pose, matches, read_points(own.root / own.ply_file_path)[0])
+        away, turns = residuals(pose, *places)
+        rms = float(np.sqrt(np.square(away[is_inlier]).mean()))
     turn = float(np.sqrt(np.square(turns[is_inlier]).mean()))
     return Alignment(pose, words, len(matches), int(is_inlier.sum()), rms, max(distance, 1e-12), turn)
 
@@ -158,6 +167,41 @@ def similarity(own: Array, truth: Array) -> Pose | None:
         return Pose(rotation, shift, scale)
     except InputError:
         return None
+
+
+def seen_alike(pose: Pose, matches: Sequence[Match], points: Array) -> Pose:
+    """`pose`, moved until the true cameras see `points` [P, 3] of the reconstruction where its own cameras do: least
+    squares of their distances in the pictures, those of more than a thousandth of the width pulling less.
+
+    Where a camera is off, its position and axes are together, so that its picture fits: each alone says less.
+    """
+    points = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
+    own, true = ([pair[side].camera for pair in matches] for side in (0, 1))
+    seen = places_in_pictures(own, points)
+    known = np.isfinite(seen) & np.isfinite(places_in_pictures(true, pose.points(points)))
+    if known.sum() < FEWEST:
+        return pose
+    middle = pose.points(points).mean(axis=0)
+    size = float(np.median([np.linalg.norm(camera.position - middle) for camera in true]))
+
+    def moved(steps: Array) -> Pose:
+        turn, scale = Rotation.from_rotvec(steps[:3]).as_matrix(), float(np.exp(steps[6]))
+        return Pose(turn, middle + size * steps[3:6] - scale * turn @ middle, scale).after(pose)
+
+    def apart(steps: Array) -> Array:
+        off = (places_in_pictures(true, moved(steps).points(points)) - seen)[known]
+        return np.nan_to_num(off, nan=1.0)
+
+    return moved(least_squares(apart, np.zeros(7), loss="soft_l1", f_scale=1e-3).x)
+
+
+def places_in_pictures(cameras: Sequence[Camera], points: Array) -> Array:
+    """[N, P, 2] where each camera's picture shows each point, in widths; NaN behind it."""
+    places = np.array([camera.world_from_camera for camera in cameras])
+    lens = np.array([np.array([(c.fx, c.fy), (c.cx, c.cy)]) / c.width for c in cameras])[:, :, None]
+    local = np.einsum("nji,npj->npi", places[:, :3, :3], points - places[:, None, :3, 3])
+    depth = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
+    return np.asarray(lens[:, 0] * local[..., :2] / depth + lens[:, 1])
 
 
 def residuals(pose: Pose, own: Array, truth: Array) -> tuple[Array, Array]:

@@ -1,12 +1,12 @@
 """What a run predicts of a view."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend.memory import check_memory
-from spacesim.data.images.tone import Tone, display_values, linear_from_display
+from spacesim.data.images.tone import Tone
 from spacesim.data.records import Camera, planes_repr
 
 A_PIXEL = {"cuda": 80, "llvm": 225}
@@ -30,6 +30,7 @@ class Prediction:
     normal: np.ndarray | None = None
     #: [H, W, 3] linear display values over black, not clipped; None of a run that does not learn radiance
     linear: np.ndarray | None = field(default=None, kw_only=True)
+    tone: Tone = field(default="srgb", kw_only=True)  #: the curve by which linear light is shown in `rgb`
 
     def __repr__(self) -> str:
         return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
@@ -56,15 +57,6 @@ class MaterialView:
 
     def __repr__(self) -> str:
         return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])
-
-
-def added_light(prediction: Prediction, to: Prediction, tone: Tone) -> Prediction:
-    """The view `prediction` in the light that it has beyond the same view under fewer sources, `to`: sources add up in
-    linear light. tone: the curve of both"""
-    shown = (prediction, to)
-    one, other = (linear_from_display(view.rgb, tone) if view.linear is None else view.linear for view in shown)
-    more = np.maximum(one - other, 0)
-    return replace(prediction, rgb=display_values(more, tone), linear=None if prediction.linear is None else more)
 
 
 def check_picture(camera: Camera) -> None:

@@ -4,27 +4,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import as_path
 from spacesim.data.records import Camera, Sun, check_camera
+from spacesim.learning.lights import CanPredict, Light, check_light, predict_light
 from spacesim.learning.pictures import write_material, write_picture
 from spacesim.learning.prediction import KINDS, MATERIAL_KINDS, MaterialView, Prediction
-
-
-class CanPredict(Protocol):
-    """What predicts views: a run of any method."""
-
-    def predict(
-        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
-    ) -> Prediction:
-        """Render one view; see `spacesim.splat.run.Predictor`."""
-
-    def draw_material(self, camera: Camera) -> MaterialView:
-        """Materials in one view; see `spacesim.splat.run.Predictor`."""
 
 
 def checked_sun(sun: Sun | Sequence[float] | None, needed: bool, whose: str) -> Sun | None:
@@ -39,13 +27,16 @@ def checked_sun(sun: Sun | Sequence[float] | None, needed: bool, whose: str) -> 
 class Rendering:
     """A view of a run, drawn when an array of it is asked for first. See `Run.render`."""
 
-    def __init__(self, run: CanPredict, camera: Camera, sun: Sun | None, exposure: float | None = None) -> None:
+    def __init__(
+        self, run: CanPredict, camera: Camera, sun: Sun | None, exposure: float | None = None, light: Light = "all"
+    ) -> None:
         check_camera(camera)
-        self.run, self.camera, self.sun, self.exposure = run, camera, sun, exposure
+        check_light(run, sun, light)
+        self.run, self.camera, self.sun, self.exposure, self.light = run, camera, sun, exposure, light
 
     @cached_property
     def _drawn(self) -> "Prediction":
-        return self.run.predict(self.camera, self.sun, exposure=self.exposure)
+        return predict_light(self.run, self.camera, self.sun, self.light, exposure=self.exposure)
 
     @property
     def rgb(self) -> np.ndarray:

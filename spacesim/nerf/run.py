@@ -73,6 +73,11 @@ class NerfRun:
         return self.networks.config.knows_sun
 
     @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return False
+
+    @property
     def has_shadows(self) -> bool:
         """Whether it casts shadows on itself, so that visibility is predicted."""
         return self.networks.config.casts_shadows

@@ -47,6 +47,11 @@ class FieldScene(ABC):
         """Whether the Sun's direction changes what is predicted."""
 
     @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return any(model.run.knows_earth for model in self.models)
+
+    @property
     @abstractmethod
     def has_shadows(self) -> bool:
         """Whether there is anything that casts them: one model on another, or on itself."""

@@ -130,6 +130,8 @@ class PredictedRun:
 
     def __init__(self, run: "Predictor") -> None:
         self.run = run
+        if run.knows_earth:
+            _log.warning("serve: %s has learned the Earth's light, which is left out: clients name a Sun", run.path)
         some = {"visibility": run.has_shadows, "object_id": bool(run.parts)}
         self.outputs = [name for name in PREDICTED if some.get(name, True)]
         path = Path(run.path).resolve()

@@ -24,6 +24,7 @@ from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
+from spacesim.learning.lights import Light
 from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
@@ -101,6 +102,10 @@ class Predictor(Protocol):
     @property
     def relightable(self) -> bool:
         """Whether the Sun's direction changes what is predicted."""
+
+    @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted: it has learned it (`light.earth`)."""
 
     @property
     def has_shadows(self) -> bool:
@@ -187,6 +192,11 @@ class Run:
         return self.light is not None and self.light.config.field.knows_sun
 
     @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return self.light is not None and bool(self.light.config.earth)
+
+    @property
     def has_shadows(self) -> bool:
         """Whether its method knows visibility."""
         return self.light is not None and self.light.config.shadow is not None
@@ -208,17 +218,22 @@ class Run:
 
     @checked
     def render(
-        self, camera: Camera, sun: Sun | Sequence[float] | None = None, exposure: float | None = None
+        self,
+        camera: Camera,
+        sun: Sun | Sequence[float] | None = None,
+        exposure: float | None = None,
+        light: Light = "all",
     ) -> "Rendering":
         """What `camera` sees under a Sun: rgb, alpha, depth, normal and visibility as numpy arrays, drawn when they are
         asked for.
 
         sun: (azimuth, elevation) in degrees, a direction [3] towards it, or a Sun; a run that is not `relightable`
-        knows the light of its pictures alone;  exposure: EV, of a run whose colours are linear
-        Raises InputError where a run needs the Sun and none is given.
+        knows the light of its pictures alone;  exposure: EV, of a run whose colours are linear;  light: "all", or that
+        of the "sun" or the "earth" alone, of a `Sun` with its Earth and a run that has learned it (`knows_earth`)
+        Raises InputError where a run needs the Sun and none is given, and for the Earth's light where there is none.
         """
         direction = checked_sun(sun, self.relightable, f"a run of {self.config['method']}")
-        return Rendering(self, camera, direction, exposure)
+        return Rendering(self, camera, direction, exposure, light)
 
     def with_embedding(self, embedding: np.ndarray) -> "Run":
         """The run with every view drawn with `embedding` [E] in place of the mean of the training pictures'. Raises
@@ -266,7 +281,8 @@ class Run:
         if curve := self.curve:
             light = display_light(rgb, curve, stops_more)
             rgb = adjust_exposure(rgb, curve.tone, stops_more, curve.white)
-        return replace(_prediction(output, rgb, visibility, normals), linear=light)
+        tone = self.curve.tone if self.curve else "srgb"
+        return replace(_prediction(output, rgb, visibility, normals), linear=light, tone=tone)
 
     @property
     def albedo_is_relative(self) -> bool:

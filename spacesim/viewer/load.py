@@ -1,5 +1,6 @@
 """From what the command line names to what is shown."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from spacesim.data.errors import InputError
@@ -36,9 +37,10 @@ def load_setup(path: Path, data: Path | None = None, out: Path | None = None) ->
         elif folders[0] is not None:
             dataset = read_dataset(folders[0])
     poses = tuple(placed.pose for placed in scene.posed_at(0.0).models)
+    sun = scene.sun_at(0.0) or _initial_sun(dataset)
     return ViewerSetup(
         SceneRenderer(composition),
-        SceneState(poses, scene.sun_at(0.0) or _initial_sun(dataset)),
+        SceneState(poses, replace(sun, earth=scene.earth) if scene.earth else sun),
         tuple(folders),
         dataset,
         out or Path(),

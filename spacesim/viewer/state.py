@@ -118,7 +118,7 @@ class SceneState:
             return False
         if self.sun is None or other.sun is None:
             return self.sun is other.sun
-        return bool(np.array_equal(self.sun.direction, other.sun.direction))
+        return np.array_equal(self.sun.direction, other.sun.direction) and self.sun.earth == other.sun.earth
 
 
 @dataclass

@@ -12,7 +12,8 @@ from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quat
 from spacesim.data.identity import training_digest
 from spacesim.data.images import write_png
 from spacesim.data.records import Camera, Dataset, Frame, Sun
-from spacesim.eval.align import align, match_frames, moved_dataset, residuals, similarity
+from spacesim.data.store import write_points
+from spacesim.eval.align import align, match_frames, moved_dataset, places_in_pictures, residuals, similarity
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.write import write_report
 from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
@@ -69,6 +70,31 @@ def test_the_similarity_is_found(truth, tmp_path):
     for frame, true in zip(back.train, truth.train, strict=True):
         np.testing.assert_allclose(frame.camera.world_from_camera, true.camera.world_from_camera, atol=1e-9)
         np.testing.assert_allclose(frame.sun.direction, true.sun.direction, atol=1e-9)
+
+
+def test_the_model_stands_where_cameras_see_it(tmp_path):
+    """Cameras on an arc whose axes are off by a degree, as their positions are, so that their pictures fit."""
+    points = fibonacci_sphere(40)
+    places = [20 * np.array([np.cos(a), np.sin(a), 0.3]) for a in np.linspace(0.0, 1.0, 12)]
+    truth = Dataset(tmp_path / "truth", tuple(looking(places)), ())
+    wrong = []
+    for k, frame in enumerate(truth.train):
+        off = rotation_from_quaternion([1.0, 0.0, 0.0, 0.009 * (k > 5)])  # about the points' middle
+        wrong.append(replace(frame, camera=moved(frame.camera, INSIDE.after(Pose(off)))))
+    own = Dataset(tmp_path / "own", tuple(wrong), (), ply_file_path="points.ply")
+    own.root.mkdir()
+    write_points(own.root / "points.ply", INSIDE.points(points), np.zeros((40, 3), np.uint8))
+
+    def off(pose: Pose) -> float:
+        true, found = (
+            places_in_pictures([frame.camera for frame in data.train], moving.points(INSIDE.points(points)))
+            for data, moving in ((truth, pose), (own, Pose()))
+        )
+        return float(np.abs(true - found).mean())
+
+    by_cameras = align(replace(own, ply_file_path=None), truth)
+    by_views = align(own, truth)
+    assert off(by_views.pose) < 0.6 * off(by_cameras.pose)
 
 
 def test_noise_is_the_residual_of_the_alignment(truth, tmp_path):

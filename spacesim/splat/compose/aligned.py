@@ -70,6 +70,11 @@ class AlignedRun:
         return self.run.relightable
 
     @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return self.run.knows_earth
+
+    @property
     def has_shadows(self) -> bool:
         """Whether its method knows visibility."""
         return self.run.has_shadows

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, Array, look_at
 from spacesim.data.records import Camera, Sun, check_size
@@ -79,6 +80,26 @@ class SunEntry:
         if self.azimuth_deg is not None and self.elevation_deg is not None:
             return Sun.from_angles(self.azimuth_deg, self.elevation_deg)
         return Sun(np.array(self.direction))
+
+
+@dataclass(frozen=True)
+class EarthEntry(SunEntry):
+    """Where the Earth is, as `SunEntry` says it of the Sun, and what it is like."""
+
+    angular_radius_deg: float = Earth.angular_radius_deg  #: degrees, see `Earth`
+    albedo: float = Earth.albedo  #: see `Earth`
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        try:
+            self.earth  # noqa: B018  checks the numbers
+        except InputError as error:
+            raise InputError(str(error).removeprefix("earth_")) from None
+
+    @property
+    def earth(self) -> Earth:
+        """The record."""
+        return Earth(self.sun.direction, self.angular_radius_deg, self.albedo)
 
 
 @dataclass(frozen=True)
@@ -183,6 +204,7 @@ class SceneEntry:
 
     models: tuple[ModelEntry, ...]  #: in the order that object numbers count
     sun: SunEntry | None = None  #: None: from keyframes or the caller
+    earth: EarthEntry | None = None  #: None: no light of the Earth
     camera: CameraEntry | None = None  #: None: from the caller
     shadows: str = ComposeConfig.shadows  #: of models on each other, see `ComposeConfig`
     frames: int | None = None  #: pictures; None: up to the last keyframe, 120 of an orbit, else 1

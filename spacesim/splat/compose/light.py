@@ -15,6 +15,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.members import Ensemble
@@ -62,6 +63,7 @@ class EnsembleLight:
     ensemble: Ensemble  #: the members
     poses: Sequence[Pose]  #: one of each
     sun: Array | None  #: [3] towards it, world; None where none is given, and no shadows are asked for
+    earth: Earth | None  #: that it lights, world; its light reaches into all shadows of members on each other
     shadows: str  #: of members on each other, as `ComposeConfig.shadows`
     beside: SunOccluder | None  #: what else stands in the Sun's way
     cache: LightCache  #: of this ensemble
@@ -69,32 +71,47 @@ class EnsembleLight:
     def shade(self, camera: Camera) -> list[Light]:
         """Of each member, in the shadows of the others."""
         between = self.cross_visibilities()
-        parts = [self._alone(k, camera) for k in range(len(self.poses))]
-        return [_dim(part, share) for part, share in zip(parts, between, strict=True)]
+        return [self._lit(k, camera, share) for k, share in enumerate(between)]
 
     def cross_visibilities(self) -> list[Float | None]:
         """Of each member v_inter of 4.15, Float [N of it], or None where no other can be before the Sun."""
         if self.shadows == "none":
             return [None] * len(self.poses)
         assert self.sun is not None, "a scene with such shadows asks for a Sun first"
-        others = b"" if self.beside is None else self.beside.key
-        key = (b"".join(pose.key for pose in self.poses), self.sun.tobytes(), self.shadows, others)
         sun = self.sun
 
         def compute() -> list[Float | None]:
             between = [self._cross_visibility(sun, k) for k in range(len(self.poses))]
             return between if self.beside is None else self._behind(self.beside, sun, between)
 
-        return self.cache.get("between", key, compute)
+        return self.cache.get("between", self._key_between, compute)
 
-    def _alone(self, k: int, camera: Camera) -> Light:
-        """Of member k as it is alone."""
+    @property
+    def _key_between(self) -> Hashable:
+        """Of all that `cross_visibilities` depends on."""
+        towards = None if self.sun is None else self.sun.tobytes()
+        others = b"" if self.beside is None else self.beside.key
+        return b"".join(pose.key for pose in self.poses), towards, self.shadows, others
+
+    def _lit(self, k: int, camera: Camera, share: Float | None) -> Light:
+        """Of member k behind others that let a share of sunlight through, Float [N of it] or None for all."""
         member, pose = self.ensemble.members[k], self.poses[k]
         near, towards = pose.camera_in_model(camera), None if self.sun is None else pose.direction_in_model(self.sun)
-        light = b"" if towards is None else towards.tobytes()
-        sunlight = self.cache.get(("sunlight", k), light, lambda: member.sunlight(towards))
-        key = near.world_from_camera.tobytes(), light
-        return self.cache.get(("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight))
+        direction = b"" if towards is None else towards.tobytes()
+        sunlight = self.cache.get(("sunlight", k), direction, lambda: member.sunlight(towards))
+        earth = pose.earth_in_model(self.earth) if member.run.knows_earth else None
+        alone = None if earth is None else share  # where the Earth shines, too, sunlight alone is dimmed
+        key = near.world_from_camera.tobytes(), direction, earth, None if alone is None else self._key_between
+
+        def compute() -> Light:
+            linear = member.curve is not None
+            arriving = sunlight if sunlight is None or alone is None else sunlight.dimmed(alone, linear)
+            return member.shade(Pinhole.of(near), towards, arriving, earth)
+
+        part = self.cache.get(("light", k), key, compute)
+        if alone is None:
+            return _dim(part, share)
+        return part[0], part[1] if member.run.has_shadows else share
 
     def _cross_visibility(self, sun: Array, k: int) -> Float | None:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands

@@ -15,6 +15,7 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
 from spacesim.data.images.tone import Curve
 from spacesim.splat.compose.pose import Pose
@@ -87,13 +88,15 @@ class Member:
         light = self.run.light
         return None if light is None else light.sunlight(self.run.gaussians, sun)
 
-    def shade(self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None) -> tuple[list[Float], Float | None]:
-        """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun: in the
-        model's frame, the latter unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
+    def shade(
+        self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None, earth: Earth | None = None
+    ) -> tuple[list[Float], Float | None]:
+        """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun, earth:
+        in the model's frame, the latter two unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
         run = self.run
         if run.light is None:
             return list(_harmonic_colors(run.gaussians.rows(), camera)), None
-        return run.light.shade_picture(run.gaussians, camera, sun, sunlight=sunlight)
+        return run.light.shade_picture(run.gaussians, camera, sun, sunlight=sunlight, earth=earth)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from spacesim.data.images.tone import as_bytes
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.lock import lock_folder
 from spacesim.data.store import intrinsics_of
+from spacesim.data.transforms import earth_keys
 from spacesim.learning.pictures import write_picture
 from spacesim.splat.compose.posed_scene import PosedScene, SceneFrame
 from spacesim.splat.compose.scene import ComposedPrediction
@@ -153,6 +154,7 @@ def _describe_frame(frame: SceneFrame, exposure: float | None) -> dict[str, Json
         "transform_matrix": camera.opengl.tolist(),
         **intrinsics_of(camera),
         "sun_direction": None if frame.sun is None else frame.sun.direction.tolist(),
+        **(earth_keys(frame.sun.earth) if frame.sun and frame.sun.earth else {}),
         "models": [
             {
                 "name": model.name,

@@ -26,9 +26,9 @@ def bake_scene(composition: GaussianComposition, sun: Sun | None) -> Gaussians:
         run, gaussians = model.run, model.run.gaussians
         if run.light is not None:
             direction = None if sun is None else model.pose.direction_in_model(sun.direction)
-            gaussians = bake(
-                gaussians, run.light, direction, others=visible
-            )  # linear colours are dimmed before their tone curve
+            earth = model.pose.earth_in_model(sun.earth) if sun and run.knows_earth else None
+            # linear colours are dimmed before their tone curve
+            gaussians = bake(gaussians, run.light, direction, others=visible, earth=earth)
         harmonics = gaussians.to_numpy()["sh"].astype(np.float64)
         if visible is not None and run.light is None:
             harmonics = dim_harmonics(harmonics, np.array(visible, np.float64))

@@ -1,10 +1,11 @@
 """Where a model stands in a scene, how it is turned and how large it is there (thesis 3.11 to 3.13)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
@@ -78,6 +79,10 @@ class Pose:
         """[3], a direction of the world in the model's axes; the same numbers where nothing is turned."""
         turned: Array = self.rotation.T @ np.asarray(direction, np.float64)
         return turned
+
+    def earth_in_model(self, earth: Earth | None) -> Earth | None:
+        """An Earth in the model's axes."""
+        return None if earth is None else replace(earth, direction=self.direction_in_model(earth.direction))
 
     def camera_in_model(self, camera: Camera) -> Camera:
         """The camera that sees the model in its own frame and scale as `camera` sees it in the world: the same picture,

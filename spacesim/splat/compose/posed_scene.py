@@ -4,9 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked
+from spacesim.learning.lights import Light
 from spacesim.learning.rendering import Rendering, checked_sun
 from spacesim.splat.compose.path import (
     FPS,
@@ -44,6 +46,7 @@ class PosedScene:
     orbit: Orbit | None = None  #: on which the camera flies
     frames: int = 1  #: pictures, 1 / fps seconds apart
     fps: float = FPS  #: pictures a second
+    earth: Earth | None = None  #: that the Sun lights at all times, where a Sun does not name its own
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda key: key.time)))
@@ -73,18 +76,24 @@ class PosedScene:
         sun: Sun | Sequence[float] | None = None,
         exposure: float | None = None,
         time: float = 0.0,
+        light: Light = "all",
     ) -> Rendering:
         """What a camera sees of the scene at a time, seconds: as `Run.render`. camera, sun: by default the scene's own
-        then. Raises InputError where one is needed and none is given."""
+        then; the Earth, too, unless a `Sun` says. Raises InputError where one is needed and none is given."""
         camera = self.at(time).camera if camera is None else camera
         composition = self.posed_at(time)
         whose = str(composition.path or "the scene")
-        direction = checked_sun(self.sun_at(time) if sun is None else sun, composition.relightable, whose)
-        return Rendering(composition, camera, direction, exposure)
+        towards = checked_sun(self.sun_at(time) if sun is None else sun, composition.relightable, whose)
+        if not isinstance(sun, Sun):
+            towards = self._with_earth(towards)
+        return Rendering(composition, camera, towards, exposure, light)
 
     def sun_at(self, time: float) -> Sun | None:
         """The Sun at a time, seconds; None where none is given."""
-        return self._track(lambda key: key.sun, interpolate_sun, time) or self.sun
+        return self._with_earth(self._track(lambda key: key.sun, interpolate_sun, time) or self.sun)
+
+    def _with_earth(self, sun: Sun | None) -> Sun | None:
+        return sun if sun is None or sun.earth or self.earth is None else replace(sun, earth=self.earth)
 
     def posed_at(self, time: float) -> GaussianComposition:
         """The models where they are at a time, seconds."""

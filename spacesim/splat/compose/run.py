@@ -96,6 +96,11 @@ class ComposedRun:
         return bool(self.composition.relightable)
 
     @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return bool(self.composition.knows_earth)
+
+    @property
     def has_shadows(self) -> bool:
         """Whether there is anything that casts them: one model on another, or on itself."""
         return bool(self.composition.has_shadows)

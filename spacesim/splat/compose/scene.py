@@ -158,6 +158,11 @@ class GaussianComposition:
         """Whether the Sun's direction changes what is predicted."""
         return self._shades or any(model.run.relightable for model in self.models)
 
+    @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+        return any(model.run.knows_earth for model in self.models)
+
     def stops(self, exposure: float | None) -> float:
         """By how many EV pictures are exposed more than those of training. exposure: EV, or None for theirs. Raises
         InputError where not all models are linear, of one tone curve and exposure, and for no such exposure."""
@@ -178,7 +183,8 @@ class GaussianComposition:
         normal = drawn.image("normal") if normals else None
         rgb = drawn.image("rgb", stops)
         alpha, depth = drawn.image("alpha"), drawn.image("depth")
-        return ComposedPrediction(rgb, alpha, depth, visibility, normal, drawn.image("id"), linear=drawn.light(stops))
+        seen = ComposedPrediction(rgb, alpha, depth, visibility, normal, drawn.image("id"), linear=drawn.light(stops))
+        return replace(seen, tone=drawn.curve.tone) if drawn.curve else seen
 
     def draw_material(self, camera: Camera) -> MaterialView:
         """What one view shows of the models' materials. Raises InputError where one has none."""
@@ -350,8 +356,9 @@ class GaussianComposition:
         return joined, self._ensemble.joined([[plane] for plane in seen])[0]
 
     def _light(self, poses: Sequence[Pose], sun: Sun | None) -> EnsembleLight:
-        direction, shadows = None if sun is None else sun.direction, self.config.shadows if self._shades else "none"
-        return EnsembleLight(self._ensemble, poses, direction, shadows, self._beside, self._cache)
+        direction, earth = (None, None) if sun is None else (sun.direction, sun.earth)
+        shadows = self.config.shadows if self._shades else "none"
+        return EnsembleLight(self._ensemble, poses, direction, earth, shadows, self._beside, self._cache)
 
 
 def _log_choices(models: Sequence[PlacedRun], ensemble: Ensemble) -> None:

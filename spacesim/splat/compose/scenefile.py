@@ -1,6 +1,7 @@
 """Scenes of trained runs as TOML files (docs/reference/composed-scenes.md): reading them, line by line where they are
 wrong, and writing them."""
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,6 +29,8 @@ RULES = Rules(spread=("resolution",))
 
 T = TypeVar("T")
 
+log = logging.getLogger(__name__)
+
 
 def load_scene(
     path: str | Path, load: Callable[[Path], Any] | None = None, compose: Callable[..., Any] = GaussianComposition
@@ -53,8 +56,13 @@ def load_scene(
     width = camera.width if camera else RESOLUTION[0]
     keyframes = [_keyframe(keyframe, k, entry, models, width, document) for k, keyframe in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
-    sun = entry.sun.sun if entry.sun else None
-    return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps)
+    sun, earth = entry.sun.sun if entry.sun else None, entry.earth.earth if entry.earth else None
+    if earth and not composition.knows_earth:
+        where = document.label(("earth",))
+        raise InputError(f"{where}: expected a model that has learned the Earth's light (light.earth), found none")
+    if earth and (without := [model.name for model in models if not model.run.knows_earth]):
+        log.info("%s: has not learned the Earth's light and is drawn without it", ", ".join(without))
+    return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps, earth)
 
 
 def save_scene(path: Path, scene: PosedScene) -> None:
@@ -74,6 +82,10 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     ]
     if scene.sun is not None:
         values["sun"] = _sun_values(scene.sun)
+    earth = (scene.sun and scene.sun.earth) or scene.earth
+    if earth is not None and scene.composition.knows_earth:
+        values["earth"] = _sun_values(Sun(earth.direction))
+        values["earth"] |= {"angular_radius_deg": float(earth.angular_radius_deg), "albedo": float(earth.albedo)}
     if scene.camera is not None:
         values["camera"] = _camera_values(scene.camera, scene.orbit)
     values["keyframes"] = [_keyframe_values(key) for key in scene.keyframes]

@@ -6,6 +6,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.memory import check_memory
+from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array, fibonacci_sphere, look_at
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
@@ -23,12 +24,18 @@ CHUNK = 1 << 14  #: Gaussians that are fitted at once
 
 
 def bake(
-    gaussians: Gaussians, light: LightModel, sun: np.ndarray | None, degree: int = 3, others: Float | None = None
+    gaussians: Gaussians,
+    light: LightModel,
+    sun: np.ndarray | None,
+    degree: int = 3,
+    others: Float | None = None,
+    earth: Earth | None = None,
 ) -> Gaussians:
     """The Gaussians with the colours, shadows included, that they have under a Sun in the direction `sun` [3], or None
     for a model that does not take one.
 
     others: Float [N], the share of sunlight that other models let through (v_inter of 4.16), or None for all of it
+    earth: that the Sun lights, for a model that has learned its light; others do not shade it
     Harmonics of `degree` are fitted by least squares to the colours from `VIEWS` directions around, weighted by how
     much of each Gaussian is seen from there; what is sharper in the view than they can be, such as a glint, is
     smoothed. Colours are sRGB values, as in `vanilla`. Raises MemoryError where they do not fit into memory.
@@ -38,6 +45,8 @@ def bake(
     colors = np.empty((VIEWS, 3, gaussians.count), np.float32)
     weights = np.empty((VIEWS, gaussians.count), np.float32)
     sunlight = light.sunlight(gaussians, sun)  # from all around the same
+    if earth is not None and others is not None:
+        sunlight, others = sunlight.dimmed(others, light.config.curve is not None), None
     arrays = gaussians.to_numpy()
     centre = np.median(arrays["means"].astype(np.float64), axis=0)
     away = np.linalg.norm(arrays["means"] - centre, axis=1)
@@ -46,7 +55,7 @@ def bake(
         # A camera of parallel rays sees every Gaussian in one direction; how far it is away makes no difference.
         pose = look_at(centre - 2 * radius * direction, centre)
         camera = Orthographic.of(OrthographicCamera.from_extent(pose, PIXELS, PIXELS, 2 * radius))
-        shown, _ = light.shade_picture(gaussians, camera, sun, sunlight=sunlight)
+        shown, _ = light.shade_picture(gaussians, camera, sun, sunlight=sunlight, earth=earth)
         if others is not None:
             shown = [color * others for color in shown]
         if light.config.curve:

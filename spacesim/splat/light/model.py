@@ -29,6 +29,7 @@ from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.tone import decode_srgb
 
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
@@ -71,6 +72,12 @@ class Sunlight:
 
     visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
     bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
+
+    def dimmed(self, share: Float, linear: bool) -> "Sunlight":
+        """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
+        visibility = share if self.visibility is None else self.visibility * share
+        of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
+        return Sunlight(visibility, [light * of_light for light in self.bounced])
 
 
 @dataclass

@@ -20,34 +20,48 @@ SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
 
 class SunControls:
-    """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters."""
+    """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters. A box where
+    a model knows the light of the Earth, and one is named: it stays where the data or the scene have it."""
 
-    def __init__(self, gui: "viser.GuiApi", shared: SharedScene) -> None:
+    def __init__(self, gui: "viser.GuiApi", shared: SharedScene, knows_earth: bool = False) -> None:
         self._shared = shared
         sun = shared.state.sun
         azimuth, elevation = sun.angles if sun else (0.0, 0.0)
+        self._named = sun.earth if sun and knows_earth else None
+        self.earth: viser.GuiCheckboxHandle | None = None
         with gui.add_folder("Sun", order=2):
             self.azimuth = gui.add_slider("Azimuth", 0.0, 360.0, 0.1, round(azimuth, 1), hint="degrees, from +x to +y")
             self.elevation = gui.add_slider("Elevation", -90.0, 90.0, 0.1, round(elevation, 1), hint="degrees above xy")
-        self.azimuth.on_update(self._on_slider)
-        self.elevation.on_update(self._on_slider)
+            if self._named is not None:
+                self.earth = gui.add_checkbox("Earth", True, hint="its light, from where the data have it")
+                self.earth.on_update(self._on_change)
+        self.azimuth.on_update(self._on_change)
+        self.elevation.on_update(self._on_change)
 
     def drag(self, sun: Sun) -> None:
-        """The Sun was moved by other means."""
-        self._shared.change(lambda state: replace(state, sun=sun))
-        self.follow(sun)
+        """The Sun was moved by other means, the Earth, too, where it names one."""
+        self._named = self._named and (sun.earth or self._named)
+        lit = self._with_earth(sun)
+        self._shared.change(lambda state: replace(state, sun=lit))
+        self.follow(lit)
 
     def follow(self, sun: Sun) -> None:
         """Put the sliders where the Sun is."""
         azimuth, elevation = sun.angles
         self.azimuth.value, self.elevation.value = round(azimuth, 1) % 360, round(elevation, 1)
+        if self.earth is not None:
+            self.earth.value = sun.earth is not None
 
-    async def _on_slider(self, event: "viser.GuiEvent") -> None:
+    def _with_earth(self, sun: Sun) -> Sun:
+        return Sun(sun.direction, self._named if self.earth is not None and self.earth.value else None)
+
+    async def _on_change(self, event: "viser.GuiEvent") -> None:
         if event.client is None:  # we moved it ourselves
             return
         azimuth = clamp(self.azimuth.value, 0, 360, 0)
         elevation = clamp(self.elevation.value, -90, 90, 0)
-        self._shared.change(lambda state: replace(state, sun=Sun.from_angles(azimuth, elevation)))
+        sun = self._with_earth(Sun.from_angles(azimuth, elevation))
+        self._shared.change(lambda state: replace(state, sun=sun))
 
 
 class ModelControls:

@@ -7,6 +7,7 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.records import Sun
 from spacesim.splat.compose.scenefile import save_scene
 from spacesim.viewer.client import Client
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
@@ -139,7 +140,9 @@ class PathControls:
             client.look_from(shot.camera.world_from_camera, vertical_fov(shot.camera))
         if path.moves_scene:
             poses = tuple(placed.pose for placed in shot.composition.models)
-            self._put(SceneState(poses, shot.sun or self._shared.state.sun))
+            now = self._shared.state.sun
+            sun = now if shot.sun is None else Sun(shot.sun.direction, now.earth if now else None)
+            self._put(SceneState(poses, sun))
 
 
 class FileControls:

@@ -296,6 +296,7 @@ def test_poses_of_pictures_are_found(tmp_path):
     assert read_png(tmp_path / "out" / "cameras.png").ndim == 3
     report = json.loads((tmp_path / "out" / "structure.json").read_text())
     assert report["pictures"] == 12
+    assert report["scale_from"] == "distance"
     assert report["not_registered"] == []
     assert report["reprojection_error_px"] < 1
     assert max(report["extent"]) < 2.1 * np.linalg.norm(BOX)
@@ -358,5 +359,8 @@ def test_a_field_of_view_that_pictures_do_not_fix_is_warned_of(tmp_path, caplog)
     assert report["k1"] == 0  # nothing is made up
     caplog.clear()
     fov = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / (6 * FOCAL))))
-    import_dataset("images", tmp_path / "in", tmp_path / "known", masks="none", fov=fov)
-    assert not [record for record in caplog.records if "field of view" in record.getMessage()]
+    known = import_dataset("images", tmp_path / "in", tmp_path / "known", masks="none", fov=fov, length=2.0)
+    assert [record.getMessage().split(": ")[2] for record in caplog.records] == [
+        "there are no silhouettes; name distance if it is known"
+    ]
+    assert json.loads((known.root / "structure.json").read_text())["scale_from"] == "points"

@@ -34,7 +34,7 @@ CONFIGS = {
         replace(MAP, bias=5.0, grazing="both", size=96, method=MappingConfig("median")),
     ),
     "bounce": LightConfig(
-        replace(FIELD, features=7, inputs=SurfaceConfig(**ENCODINGS)), replace(MAP, size=96), bounce=20
+        replace(FIELD, features=7, inputs=SurfaceConfig(**ENCODINGS)), replace(MAP, size=96), bounce=20, earth=True
     ),
     "park": LightConfig(
         FIELD,

@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spacesim.cli.printing import NO_EARTH
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
-from spacesim.data.images import linear_from_srgb
-from spacesim.data.records import Dataset
+from spacesim.data.files import read_json
+from spacesim.data.images import linear_from_srgb, read_png
+from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import load_truth
-from spacesim.learning.prediction import added_light
+from spacesim.learning.lights import added_light
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.serve.draw import PredictedRun
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
@@ -44,7 +47,7 @@ def run(earthlit, tmp_path_factory) -> Run:
 def pictures(run, frame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of both sources, of the Sun alone, and linear light of the Earth alone."""
     both, alone = (run.predict(frame.camera, sun) for sun in (frame.sun, replace(frame.sun, earth=None)))
-    return both.rgb, alone.rgb, linear_from_srgb(added_light(both, alone, "srgb").rgb)
+    return both.rgb, alone.rgb, linear_from_srgb(added_light(both, alone).rgb)
 
 
 def test_frames_name_the_earth_that_lights_them(earthlit):
@@ -91,20 +94,20 @@ def test_the_layers_are_those_of_the_truth(earthlit, run):
 
 
 def test_where_no_earth_is_given_there_is_none(run, earthlit):
-    """Nor in compositions; an aligned run sees it where it stands in the world."""
+    """A run that is turned sees it where it stands in the world, aligned or in a composition."""
     frame = earthlit.test[0]
     both, alone, earth = pictures(run, frame)
     assert (both >= alone - 1e-5).all()
     assert earth.max() > 0.02
-    composed = GaussianComposition([PlacedRun(run)]).predict(frame.camera, frame.sun)
-    np.testing.assert_allclose(composed.rgb, alone, atol=1e-5)
+    composed = GaussianComposition([PlacedRun(run)])
+    np.testing.assert_array_equal(composed.predict(frame.camera, frame.sun).rgb, both)
+    np.testing.assert_array_equal(composed.predict(frame.camera, replace(frame.sun, earth=None)).rgb, alone)
     half = np.sqrt(0.5)
     pose = Pose(np.array([[half, 0, half], [0, 1, 0], [-half, 0, half]]), [0.4, -0.2, 0.1], 1.0)
     there = moved_frame(frame, pose)
     assert np.abs(there.sun.earth.direction - frame.sun.earth.direction).max() > 0.5
-    np.testing.assert_allclose(
-        AlignedRun(run, pose).predict(there.camera, there.sun).rgb, both, atol=5e-3
-    )  # by other beams
+    for turned in (AlignedRun(run, pose), GaussianComposition([PlacedRun(run, pose)])):
+        np.testing.assert_allclose(turned.predict(there.camera, there.sun).rgb, both, atol=5e-3)  # by other beams
     drawn = SunlitRun.of(run, frame.sun)
     np.testing.assert_allclose(drawn.draw(frame.camera, drawn.shade(frame.camera))[..., :3], both, atol=1e-5)
 
@@ -130,10 +133,53 @@ def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
     assert np.abs(other - earth).max() > 0.01
     frame = earthlit.test[0]
     np.testing.assert_allclose(linear_from_srgb(load_run(run.path).predict(frame.camera, frame.sun).rgb), both)
+    for light, layer in (("sun", sun), ("earth", earth)):
+        shown = run.render(frame.camera, frame.sun, light=light).rgb
+        np.testing.assert_allclose(linear_from_srgb(shown), layer, atol=1e-6)
     refused = spacesim(
         "render", run.path, "--frame", 16, "--earth", "none", "--sun", "none", "--out", tmp_path / "b.png"
     )
     assert refused.is_refusal("--sun", "no frame says")
+
+
+def test_a_scene_is_evaluated_in_the_light_of_its_data(spacesim, run, earthlit, tmp_path):
+    """As the run alone is."""
+    (tmp_path / "scene.toml").write_text(f'[[models]]\nrun = "{run.path}"\n')
+    scores = []
+    for number, what in enumerate([run.path, tmp_path / "scene.toml"]):
+        done = spacesim("eval", what, "--data", earthlit.root, "--out", tmp_path / str(number))
+        assert done.code == 0, done.errors
+        scores.append(read_json(tmp_path / str(number) / "metrics.json")["image"]["psnr"]["mean"])
+    assert scores[0] == scores[1]
+
+
+@pytest.mark.parametrize("form", ["ply", "mesh", "html"])
+def test_exports_have_it_where_it_is_named(spacesim, run, tmp_path, form):
+    """Else a sentence says that it is left out."""
+    sun = () if form == "html" else ("--sun", "20,40")
+    contents = []
+    for number, earth in enumerate([(), ("--earth", "none"), ("--earth", "0,-90")]):
+        out = tmp_path / f"{number}.{form.replace('mesh', 'ply')}"
+        done = spacesim("export", run.path, f"--{form}", out, *sun, *earth)
+        assert done.code == 0, done.errors
+        assert (NO_EARTH in done.errors) == (earth == ())
+        contents.append(out.read_bytes())
+    assert contents[0] == contents[1] != contents[2]
+
+
+def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, run, earthlit, tmp_path):
+    options = "--frame", 16, "--frames", 1, "--keep-frames", "--out", tmp_path / "sweep"
+    done = spacesim("sweep", run.path, *options)
+    assert done.code == 0, done.errors
+    frame = earthlit.test[0]
+    sun = Sun(Sun.from_angles(0, 30).direction, frame.sun.earth)
+    (picture,) = (tmp_path / "sweep/frames").iterdir()
+    np.testing.assert_allclose(read_png(picture)[..., :3] / 255, run.predict(frame.camera, sun).rgb, atol=1 / 255)
+
+
+def test_a_served_run_says_that_it_is_left_out(run, caplog):
+    PredictedRun(run)
+    assert f"{run.path} has learned the Earth's light, which is left out" in caplog.text
 
 
 def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
@@ -146,3 +192,10 @@ def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
     for option in (("--earth", "0,0"), ("--sun", "none")):
         done = spacesim("render", blind.path, *option, "--out", tmp_path / "a.png")
         assert done.is_refusal(option[0], "light.earth", blind.path)
+    refused = spacesim("export", blind.path, "--ply", tmp_path / "a.ply", "--sun", "0,0", "--earth", "0,0")
+    assert refused.is_refusal("--earth", "light.earth", blind.path)
+    refused = spacesim("export", blind.path, "--mesh", tmp_path / "a.ply", "--earth", "0,0")
+    assert refused.is_refusal("--earth", "expected with --sun, --html, found without one")
+    frame = small_lit_dataset.test[0]
+    with pytest.raises(InputError, match=r"light: expected a run that has learned the Earth's light .*, found .*blind"):
+        blind.render(frame.camera, frame.sun, light="earth")

@@ -166,13 +166,18 @@ def _import(
         reconstruction = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
     except InputError as error:
         raise InputError(str(error).replace(f"{shown.name}: ", f"{src}: ", 1)) from None
-    extent = None
-    if settings.length is not None and has_masks:
-        extent = hull_length(reconstruction, [read_png(folder / "masks" / name) > 0 for name in reconstruction.names])
-        if extent is None:
+    extent, scale_from = None, None if settings.distance is None else "distance"
+    if settings.length is not None:
+        if has_masks:
+            masks = [read_png(folder / "masks" / name) > 0 for name in reconstruction.names]
+            extent = hull_length(reconstruction, masks)
+        scale_from = "points" if extent is None else "silhouettes"
+        if extent is not None:
+            _log.info("length: taken of what the silhouettes enclose")
+        else:
             _log.warning(
-                "length: taken of the points, which may cover a part of the object: its silhouettes show no longest "
-                "axis from the side; name distance where it is known"
+                "length: taken of the points, which may cover a part of the object: %s; name distance if it is known",
+                "its silhouettes show no longest axis from the side" if has_masks else "there are no silhouettes",
             )
     model = placed(without_floating(reconstruction), settings.length, settings.distance, extent)
     if len(model.names) < REGISTERED * len(names):
@@ -183,7 +188,7 @@ def _import(
     stream = io.BytesIO()
     Image.fromarray(draw_cameras(model)).save(stream, format="PNG")
     unit = "metres" if settings.length or settings.distance else "median distance of the cameras"
-    report = {**facts, "unit": unit, **report_of(model, names)}
+    report = {**facts, "unit": unit, "scale_from": scale_from, **report_of(model, names)}
     files = {"structure.json": json_bytes(report), "cameras.png": stream.getvalue()}
     frames = list(_frames(folder, model, has_masks, settings.masked, keys))
     points = (model.points, model.colors)

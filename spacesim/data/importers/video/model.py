@@ -17,7 +17,7 @@ _LEAST_TRACK = 3  # pictures that see a point
 _VOXELS = 64  # along an edge of the cube that silhouettes are cut from
 _WRONG = 0.02  # share of masks, and one besides, that may be wrong at a voxel
 _LONG = 1.5  # times the spread along the next axis: silhouettes from few sides stretch an object that is not long
-_LEAST_SIDE = 45.0  # degrees between the longest axis and a view, from which on its length is known
+_LEAST_SIDE = 70.0  # degrees between the longest axis and a view: from ahead silhouettes stretch it
 
 
 @dataclass(frozen=True, eq=False)

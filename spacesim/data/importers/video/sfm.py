@@ -109,6 +109,10 @@ def reconstruct(
             _adjust(colmap, models[0], focal is None, distorted)
     if not models:
         raise InputError(f"{folder.name}: {_why_none(matches)}")
+    models[0] = _triangulated(
+        colmap, database, folder, workspace, _mapping(colmap, focal, strict, distorted), models[0]
+    )
+    _adjust(colmap, models[0], focal is None, distorted)
     model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -231,21 +235,7 @@ def _map(
     distorted: bool,
 ) -> list[Any]:
     """Models, the largest first, empty where none was found. strict: pixels that a match may be off"""
-    options = colmap.IncrementalPipelineOptions()
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
-    options.num_threads = options.mapper.num_threads = 1
-    options.min_model_size = 3
-    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 100.0  # telescopes
-    options.triangulation.max_focal_length_ratio = 100.0
-    options.mapper.init_min_tri_angle = 8.0  # neighbours in a video see the object from almost one side
-    options.mapper.init_min_num_inliers = 50
-    options.mapper.abs_pose_min_num_inliers = 20
-    options.mapper.init_max_error, options.mapper.abs_pose_max_error = strict, 3 * strict
-    off = max(strict, 2.0)
-    options.mapper.filter_max_reproj_error = off
-    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = off
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = focal is None
-    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
+    options = _mapping(colmap, focal, strict, distorted)
     registered = 0
 
     def another() -> None:
@@ -262,6 +252,39 @@ def _map(
         lambda: report("poses", min(registered, count), count),
     )
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def _mapping(colmap: ModuleType, focal: float | None, strict: float, distorted: bool) -> Any:
+    """COLMAP's options of how poses and points are found."""
+    options = colmap.IncrementalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
+    options.num_threads = options.mapper.num_threads = 1
+    options.min_model_size = 3
+    options.max_focal_length_ratio = options.mapper.max_focal_length_ratio = 100.0  # telescopes
+    options.triangulation.max_focal_length_ratio = 100.0
+    options.mapper.init_min_tri_angle = 8.0  # neighbours in a video see the object from almost one side
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.abs_pose_min_num_inliers = 20
+    options.mapper.init_max_error, options.mapper.abs_pose_max_error = strict, 3 * strict
+    off = max(strict, 2.0)
+    options.mapper.filter_max_reproj_error = off
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = off
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = focal is None
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = distorted
+    return options
+
+
+def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: Path, options: Any, model: Any) -> Any:
+    """The model with its points made anew: tracks that broke while poses were worse are whole, and hold together
+    parts of a film that stood askew."""
+    output = workspace / "triangulated"
+    output.mkdir()
+    return _run(
+        colmap,
+        lambda token: colmap.triangulate_points(
+            model, database, folder, output, options=options, cancellation_token=token
+        ),
+    )
 
 
 def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
@@ -26,8 +27,11 @@ SCRIPTS = ("model.js", "shaders.js", "renderer.js", "controls.js")
 Arrays = dict[str, np.ndarray]
 
 
-def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None = None) -> None:
-    """Write `run` as a page. report: called with (steps done, of all)
+def write_page(
+    run: Run, path: Path, report: Callable[[int, int], None] | None = None, earth: Earth | None = None
+) -> None:
+    """Write `run` as a page. report: called with (steps done, of all);  earth: that any Sun lights, for a run that
+    `knows_earth`; where it is stays
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -40,14 +44,14 @@ def write_page(run: Run, path: Path, report: Callable[[int, int], None] | None =
         raise InputError(
             f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
         )
-    about, arrays = _content(run, report)
+    about, arrays = _content(run, report, earth if run.knows_earth else None)
     write_bytes(Path(path), _page(run, about, arrays).encode())
 
 
-def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonDict, Arrays]:
+def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth | None) -> tuple[JsonDict, Arrays]:
     """The data of the page, and its arrays."""
     gaussians, light = run.gaussians, run.light
-    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light) if light else 0)
+    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light, earth) if light else 0)
     done = 0
 
     def step() -> None:
@@ -57,7 +61,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None) -> tuple[JsonD
             report(done, steps)
 
     colors = tabulate_colors(gaussians, light, step)
-    sunlight = tabulate_sunlight(gaussians, light, step) if light else None
+    sunlight = tabulate_sunlight(gaussians, light, step, earth) if light else None
     arrays = _shapes(gaussians) | {"colors": colors.coefficients, "color_table": colors.table}
     means = arrays["means"].astype(np.float64)
     centre = np.median(means, axis=0)

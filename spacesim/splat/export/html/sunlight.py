@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacesim.backend import ad
 from spacesim.backend.memory import check_memory
+from spacesim.data.earth import Earth
+from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -28,7 +31,7 @@ class SunlightTables:
     side: int  #: directions on a side of the maps of visibility
     visibility: np.ndarray | None  #: uint8 [N, side^2 / 2], two directions a byte, the first in the low bits; or None
     #: int8 [K, N, 6], shares of 1/127: square root of the albedo times the light that arrives at the side of the normal
-    #: (RGB) and at the other, by components; None of a model whose light does not bounce
+    #: (RGB) and at the other, by components; None where neither light bounces nor the Earth shines
     bounce: np.ndarray | None
     bounce_table: np.ndarray | None  #: float32 [BOUNCE_SIDE^2, K]: how much of each component a Sun makes
 
@@ -43,48 +46,64 @@ def octahedral_directions(side: int) -> np.ndarray:
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
-def tabulate_sunlight(gaussians: Gaussians, light: LightModel, report: Callable[[], None]) -> SunlightTables:
-    """Tables of a model that knows the Sun, of N Gaussians. report: called `sunlight_steps` times"""
-    count, side = gaussians.count, _side(gaussians, light)
+def tabulate_sunlight(
+    gaussians: Gaussians, light: LightModel, report: Callable[[], None], earth: Earth | None = None
+) -> SunlightTables:
+    """Tables of a model that knows the Sun, of N Gaussians. report: called `sunlight_steps` times;  earth: whose light
+    is with that which bounces, of a model that has learned it: it arrives at either side under each Sun, too"""
+    count, side = gaussians.count, _side(gaussians, light, earth)
     directions = octahedral_directions(side)
     check_memory(count * len(directions) * 2, f"shadows of {count} Gaussians under {len(directions)} Suns")
     levels = np.zeros((len(directions), count), np.uint8)
     blocks = max(side // BOUNCE_SIDE, 1)
     bounced = np.zeros((BOUNCE_SIDE, BOUNCE_SIDE, count, 6), np.float32)
-    albedo = _albedo(gaussians, light)
+    more = bool(light.config.bounce) or earth is not None
+    albedo = _albedo(gaussians, light) if more else np.zeros((count, 6), np.float32)
     for index, sun in enumerate(directions):
         sunlight = light.sunlight(gaussians, sun)
         if sunlight.visibility is not None:
             levels[index] = np.rint(LEVELS * np.clip(np.array(sunlight.visibility), 0, 1))
-        if sunlight.bounced:
-            arriving = np.stack([np.array(row) for row in sunlight.bounced], axis=1)
+        if more:
+            arriving = np.zeros((count, 6), np.float32) if earth is None else _earthlight(gaussians, light, sun, earth)
+            if sunlight.bounced:
+                arriving += np.stack([np.array(row) for row in sunlight.bounced], axis=1)
             bounced[index // side // blocks, index % side // blocks] += albedo * arriving / blocks**2
         report()
     packed = np.ascontiguousarray((levels[0::2] | levels[1::2] << 4).T) if light.config.shadow else None
-    if not light.config.bounce:
+    if not more:
         return SunlightTables(side, packed, None, None)
     table, components = _principal_components(np.sqrt(bounced).reshape(BOUNCE_SIDE**2, -1))
     return SunlightTables(side, packed, components.reshape(len(components), count, 6), table)
 
 
-def sunlight_steps(gaussians: Gaussians, light: LightModel) -> int:
+def sunlight_steps(gaussians: Gaussians, light: LightModel, earth: Earth | None = None) -> int:
     """How often `tabulate_sunlight` reports."""
-    return _side(gaussians, light) ** 2
+    return _side(gaussians, light, earth) ** 2
 
 
-def _side(gaussians: Gaussians, light: LightModel) -> int:
+def _side(gaussians: Gaussians, light: LightModel, earth: Earth | None) -> int:
     if light.config.shadow is None:
-        return BOUNCE_SIDE if light.config.bounce else 0
+        return BOUNCE_SIDE if light.config.bounce or earth else 0
     return SIDE if gaussians.count <= MANY else SIDE_OF_MANY
 
 
 def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
-    """[N, 6]: of both sides, RGB each; or 0."""
-    if not light.config.bounce:
-        return np.zeros((gaussians.count, 6), np.float32)
-    first = light.config.albedos * gaussians.count
-    logits = np.array(gaussians.features)[first : first + 3 * gaussians.count].reshape(3, -1).T
+    """[N, 6]: of both sides, RGB each."""
+    logits = _features(gaussians, light.config.albedos).T
     return np.tile(1 / (1 + np.exp(-logits)), (1, 2))
+
+
+def _earthlight(gaussians: Gaussians, light: LightModel, sun: np.ndarray, earth: Earth) -> np.ndarray:
+    """float32 [N, 6]: what arrives at the side of the normal and at the other, three times each."""
+    (beams,) = light.encode_sun(sun, earth).beams
+    normals = ad.Array3f(_features(gaussians, light.config.field.features))
+    sides = [np.array(earth_irradiance(normals, direction, beams)) for direction in (-normals, normals)]
+    return np.repeat(np.stack(sides, axis=1), 3, axis=1)
+
+
+def _features(gaussians: Gaussians, first: int) -> np.ndarray:
+    """[3, N]: three features from number `first`."""
+    return np.array(gaussians.features).reshape(-1, gaussians.count)[first : first + 3]
 
 
 def _principal_components(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

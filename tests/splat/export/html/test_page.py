@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from PIL import Image
 from tiny import call
 
 from spacesim.backend.upload import upload
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Sun
@@ -29,7 +31,8 @@ from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import preset
 
 COUNT = 150
-CLOSE = {"plain": 37, "relit": 29, "linear": 34, "directions": 30}  #: dB at least
+EARTH = Earth([0.3, 0.2, -1.0], albedo=1.0)
+CLOSE = {"plain": 37, "relit": 29, "linear": 34, "directions": 30, "earthlit": 29}  #: dB at least
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -80,6 +83,7 @@ def runs() -> dict[str, Run]:
     return {
         "plain": Run(Path("plain <1>"), {"method": "vanilla", "data": {"path": ""}}, {}, plain, 0),
         "relit": lit_run("relit", shadows),
+        "earthlit": lit_run("earthlit", replace(shadows, shadow=None, bounce=0, earth=True)),
         "linear": lit_run("linear", linear, -3.0),
         "directions": lit_run("directions", LightConfig(FieldConfig(**small, inputs=DirectionsConfig()))),
     }
@@ -89,7 +93,7 @@ def runs() -> dict[str, Run]:
 def pages(runs, tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     for name, run in runs.items():
-        write_page(run, folder / f"{name}.html")
+        write_page(run, folder / f"{name}.html", earth=EARTH)
     return {name: folder / f"{name}.html" for name in runs}
 
 
@@ -137,9 +141,15 @@ def test_pictures_are_those_of_render(name, runs, tabs):
     near_and_far = [[3.0, 0.5, 1.0], [-2.0, 2.0, -1.5], [0.2, -0.1, 4.0], [1.3, -0.6, 0.1]]
     for k, eye in enumerate(near_and_far):
         camera, sun = camera_at(eye), Sun.from_angles(77 * k + 13, 50 - 35 * k)
-        rendered = np.clip(runs[name].predict(camera, sun).rgb, 0, 1)
+        rendered = np.clip(runs[name].predict(camera, replace(sun, earth=EARTH)).rgb, 0, 1)
         assert rendered.std() > 0.03
         assert psnr(drawn(tabs[name], camera, sun), rendered) > CLOSE[name], eye
+
+
+def test_the_earth_is_as_bright_as_in_render(runs, tabs):
+    camera, sun = camera_at([0.2, -0.1, -4.0]), Sun.from_angles(30, 80)
+    both, alone = (np.clip(runs["earthlit"].predict(camera, one).rgb, 0, 1) for one in (replace(sun, earth=EARTH), sun))
+    assert psnr(alone, both) + 5 < psnr(drawn(tabs["earthlit"], camera, sun), both)
 
 
 def test_a_large_splat_near_the_eye_is_cut_as_in_render(runs, tabs):

@@ -17,7 +17,7 @@ from spacesim.splat.train.checkpoint import read_tensors
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.pictures import suns
 from spacesim.splat.train.pictures.learned import LearnedPictures
-from spacesim.splat.train.pictures.suns import CHANCE, CHOICES, PER_APART, FirstSuns, SunEstimation, time_order
+from spacesim.splat.train.pictures.suns import CHANCE, CHOICES, FirstSuns, SunEstimation, time_order
 from spacesim.splat.train.start import MANY_PICTURES, sun_warning
 from spacesim.splat.train.train import train
 from spacesim.splat.train.views import TrainingViews
@@ -126,8 +126,8 @@ def test_what_is_told_of_suns_is_what_pictures_held_out_say(sunless):
     assert (estimation.told() == CHANCE).sum() == 7  # nothing is known of it
     assert "no picture held out shows enough of an object" in estimation.sentence()
     estimation.apart = np.array([20.0, np.nan])
-    np.testing.assert_allclose(estimation.told(), np.minimum(estimation.sigmas * PER_APART * 10, CHANCE))
-    assert f"estimated to {20 * PER_APART:.1f} degrees (median): two halves of 1 pictures" in estimation.sentence()
+    np.testing.assert_allclose(estimation.told(), np.minimum(estimation.sigmas * 10, CHANCE))
+    assert "estimated to 20.0 degrees (median): two halves of 1 pictures" in estimation.sentence()
     estimation.apart = np.array([0.5, 0.5])  # never less than their own
     np.testing.assert_array_equal(estimation.told(), estimation.sigmas)
     estimation.apart = np.array([100.0, 170.0])

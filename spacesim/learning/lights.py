@@ -1,0 +1,115 @@
+"""Which sources light a picture, as commands and scripts name them: the Sun, the Earth that it lights, or both."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+
+from spacesim.data.earth import Earth
+from spacesim.data.errors import InputError
+from spacesim.data.geometry import direction_from_angles
+from spacesim.data.images.tone import display_values, linear_from_display
+from spacesim.data.records import Camera, Sun
+from spacesim.learning.prediction import MaterialView, Prediction
+
+Light = Literal["all", "sun", "earth"]  #: of both sources, or of one alone
+Named = tuple[float, float] | Literal["none"] | None  #: azimuth and elevation, degrees; "none"; or nothing is said
+
+
+class CanPredict(Protocol):
+    """What predicts views: a run of any method, or a scene of them."""
+
+    @property
+    def path(self) -> Path | None:
+        """The run's folder, or the scene's file."""
+
+    @property
+    def relightable(self) -> bool:
+        """Whether the Sun's direction changes what is predicted."""
+
+    @property
+    def knows_earth(self) -> bool:
+        """Whether the light of a Sun's Earth changes what is predicted."""
+
+    def predict(
+        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
+    ) -> Prediction:
+        """Render one view; see `spacesim.splat.run.Predictor`."""
+
+    def draw_material(self, camera: Camera) -> MaterialView:
+        """Materials in one view; see `spacesim.splat.run.Predictor`."""
+
+
+def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | None = None) -> tuple[Sun | None, Light]:
+    """(the Sun, with the Earth that it lights, whose light is asked for) of what the options `--sun` and `--earth`
+    say, degrees. What they do not name is as the frame has it (`of_frame`); sun="none" asks for the Earth's light under
+    the frame's Sun;  earth: see `named_earth`
+
+    Raises InputError where a relightable run gets no Sun, and for the Earth of a run that has not learned its light.
+    """
+    light: Light = "earth" if sun == "none" else "all"
+    found = of_frame if sun is None or sun == "none" else Sun.from_angles(*sun)
+    if found is None and light == "all" and run.relightable:
+        raise InputError("sun: expected AZ,EL for a run that can be relit and a camera without a Sun, found none")
+    shown = named_earth(run, earth, of_frame.earth if of_frame else None)
+    if found is not None:
+        found = Sun(found.direction, shown)
+    if light == "earth":
+        _check_knows_earth(run, "sun")
+        if found is None or shown is None:
+            raise InputError("sun: expected AZ,EL where no frame says which Sun lights which Earth, found none")
+    return found, light
+
+
+def named_earth(run: CanPredict, earth: Named, of_frame: Earth | None = None) -> Earth | None:
+    """The Earth in a direction, as large and bright as the frame's, else as `Earth` has it; the frame's where none is
+    named. Raises InputError for one that is named for a run that has not learned its light."""
+    if earth is None or earth == "none":
+        return of_frame if earth is None else None
+    _check_knows_earth(run, "earth")
+    towards = direction_from_angles(*earth)
+    return replace(of_frame, direction=towards) if of_frame else Earth(towards)
+
+
+def check_light(run: CanPredict, sun: Sun | None, light: Light) -> None:
+    """Raise InputError for no such `light`, and for that of the Earth where a run has not learned it or `sun` has
+    none."""
+    if light not in get_args(Light):
+        raise InputError(f"light: expected one of {', '.join(get_args(Light))}, found {light!r}")
+    if light == "earth":
+        _check_knows_earth(run, "light")
+        if sun is None or sun.earth is None:
+            raise InputError("light: expected a Sun with the Earth that it lights, found none")
+
+
+def predict_light(
+    run: CanPredict,
+    camera: Camera,
+    sun: Sun | None,
+    light: Light,
+    normals: bool = False,
+    exposure: float | None = None,
+) -> Prediction:
+    """As `run.predict`, in the light of both sources or of one alone."""
+    without = sun and replace(sun, earth=None)
+    if light == "sun":
+        return run.predict(camera, without, normals, exposure)
+    seen = run.predict(camera, sun, normals, exposure)
+    return added_light(seen, run.predict(camera, without, exposure=exposure)) if light == "earth" else seen
+
+
+def added_light(prediction: Prediction, to: Prediction) -> Prediction:
+    """The view `prediction` in the light that it has beyond the same view under fewer sources, `to`: sources add up in
+    linear light."""
+    one, other = (
+        linear_from_display(view.rgb, view.tone) if view.linear is None else view.linear for view in (prediction, to)
+    )
+    more = np.maximum(one - other, 0)
+    linear = None if prediction.linear is None else more
+    return replace(prediction, rgb=display_values(more, prediction.tone), linear=linear)
+
+
+def _check_knows_earth(run: CanPredict, name: str) -> None:
+    if not run.knows_earth:
+        raise InputError(f"{name}: expected a run that has learned the Earth's light (light.earth), found {run.path}")
