@@ -76,7 +76,7 @@ def configurations(options: argparse.Namespace) -> dict[str, TrainConfig]:
         config = with_options(preset(options.preset, method), warm_start=warm_start(options.preset))
         return with_options(config, iterations=options.iterations)
 
-    view = {"light.field.inputs": "view", "light.field.embeddings": EMBEDDINGS}
+    view = {"light.field.inputs": "view", "light.field.embeddings": EMBEDDINGS, "surfels": False}
     return {
         "known": of(METHOD),
         "unknown": with_settings(of(METHOD), {"sun": "unknown"}),
