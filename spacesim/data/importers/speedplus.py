@@ -262,11 +262,11 @@ def _subsets(splits: list[list[_Label]], count: int, seed: int) -> list[list[_La
 
 
 def _draw(labels: list[_Label], count: int, random: np.random.Generator) -> list[_Label]:
-    """One from each of `count` equal pieces; all where there are no more."""
+    """One from each of `count` pieces, equal but for one label; all where there are no more."""
     if count >= len(labels):
         return labels
-    places = (np.arange(count) + random.random(count)) * len(labels) / count
-    return [labels[i] for i in np.minimum(places.astype(np.int64), len(labels) - 1)]
+    edges = np.arange(count + 1) * len(labels) // count
+    return [labels[i] for i in random.integers(edges[:-1], edges[1:])]
 
 
 @dataclass(frozen=True, eq=False)

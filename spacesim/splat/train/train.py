@@ -50,7 +50,7 @@ def train(
         trainer = Trainer(dataset, config)
     elif config.sun == "unknown":
         check_pictures(dataset)
-    of_sun = sun_warning(dataset) if config.sun == "unknown" else ""
+    of_sun = sun_warning(dataset, config.iterations) if config.sun == "unknown" else ""
     for remark in filter(None, (of_sun, scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
     with open_folder(out, described, resume, read_config):

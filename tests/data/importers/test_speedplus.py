@@ -1,5 +1,6 @@
 """SPEED+ folders, made by our exporter or by hand in the layout of the published ones, imported again."""
 
+import itertools
 import json
 import logging
 import shutil
@@ -14,6 +15,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.exporters import labelled_objects, write_speedplus
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.data.images import load_image, read_png
+from spacesim.data.importers import speedplus
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.speedplus import import_speedplus
 from spacesim.data.store import find_unreadable_files, read_dataset
@@ -163,6 +165,10 @@ def test_a_distance_limit_and_a_subset(published, tmp_path, caplog):
     assert [frame.file_path for frame in few.train] != [frame.file_path for frame in other.train]
     numbers = [int(Path(frame.file_path).stem[3:]) for frame in few.train]
     assert [number // 2 for number in numbers] == list(range(8))  # one of each pair
+    for count, seed in itertools.product(range(3, 20), range(5)):  # pieces that are not whole
+        labels = speedplus._draw(list(range(20)), count, np.random.default_rng(seed))
+        assert labels == sorted(set(labels))
+        assert len(labels) == count
     two = import_speedplus(published, tmp_path / "two", count=2)
     assert (len(two.train), len(two.test)) == (1, 1)
     all_ = import_speedplus(published, tmp_path / "all", count=1000, masks="none")
