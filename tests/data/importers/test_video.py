@@ -20,7 +20,7 @@ from spacesim.data.importers.video import frames as frames_of
 from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, strays, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
@@ -269,6 +269,37 @@ def test_points_that_float_are_left_out():
     kept = without_floating(model).points
     assert len(kept) >= 499 - 1
     assert np.linalg.norm(kept, axis=1).max() < 1.5
+
+
+def film_path(shake: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and positions [60, 3] of a camera that flies around and, after a cut, comes nearer, at a distance of about
+    one, shaken by `shake` of that."""
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(rng.integers(1, 4, 60)).astype(float)
+    angles = np.radians(0.5 * times)
+    around = np.stack([np.cos(angles), np.sin(angles), 0.2 * angles], axis=1)
+    nearer = np.array([[0.0, 0.0, 1.3]]) - np.outer(times - times[40], [0.0, 0.0, 0.01])
+    path = np.where((np.arange(60) < 40)[:, None], around, nearer)
+    return times, path + rng.normal(0, shake / np.sqrt(3), path.shape)
+
+
+@pytest.mark.parametrize("shake", [0.0, 0.001, 0.003])
+def test_a_frame_off_the_path_of_a_film_is_found(shake):
+    times, positions = film_path(shake, 1)
+    assert strays(positions, times, np.ones(60)) == {}
+    true = positions[[20, 23]].copy()
+    positions[[20, 23]] += [[0.03, 0.0, 0.0], [0.0, 0.03, 0.0]]
+    found = strays(positions, times, np.ones(60))
+    assert list(found) == [20, 23]
+    assert np.linalg.norm(list(found.values()) - true, axis=1).max() < 0.001 + 3 * shake
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_shaking_hand_is_no_error(seed):
+    times, positions = film_path(0.02, seed)
+    assert strays(positions, times, np.ones(60)) == {}
+    few = np.arange(8)
+    assert strays(positions[few], times[few], np.ones(8)) == {}
 
 
 @needs_colmap
