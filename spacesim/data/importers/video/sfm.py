@@ -68,8 +68,8 @@ def reconstruct(
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
-    times: of the pictures in their film, rising, of any unit: then cameras off its smooth path (`model.strays`) are begun
-    anew from it, and left out with a warning where that fails
+    times: of the pictures in their film, rising, of any unit: cameras off its smooth path (`model.strays`) are then
+    begun anew from it, and left out with a warning where that fails
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
