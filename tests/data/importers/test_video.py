@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import load_image, read_png, write_png
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.video import frames as frames_of
@@ -22,6 +22,7 @@ from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
 from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, strays, without_floating
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
+from spacesim.data.importers.video.sfm import on_path
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
 
@@ -300,6 +301,37 @@ def test_a_shaking_hand_is_no_error(seed):
     assert strays(positions, times, np.ones(60)) == {}
     few = np.arange(8)
     assert strays(positions[few], times[few], np.ones(8)) == {}
+
+
+@needs_colmap
+def test_a_camera_off_the_path_is_begun_anew_and_left_out_where_its_features_agree(caplog):
+    colmap = importlib.import_module("pycolmap")
+    colmap.set_random_seed(1)
+    options = colmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points2D_without_point3D = 1, 20, 0
+    model = colmap.synthesize_dataset(options)
+    names = [model.images[number].name for number in sorted(model.reg_image_ids())]
+    times = {name: float(k) for k, name in enumerate(names)}
+
+    def see(name, angle, distance):
+        pose = look_at(distance * np.array([np.cos(angle), np.sin(angle), 0.3]), (0.0, 0.0, 0.0))
+        inverse = np.linalg.inv(pose)[:3]
+        image = model.find_image_with_name(name)
+        image.frame.rig_from_world = colmap.Rigid3d(colmap.Rotation3d(inverse[:, :3]), inverse[:, 3])
+        return image
+
+    for k, name in enumerate(names):
+        image = see(name, 0.02 * k, 5.15 if k == 12 else 5.0)  # the features of 12 are those of a place off the path
+        for feature in image.points2D:
+            feature.xy = image.project_point(model.points3D[feature.point3D_id].xyz)
+    see(names[7], 0.02 * 7 + 0.03, 5.0)  # 7 is not where its features say
+    kept = on_path(colmap, model, times, lambda model: model)
+    assert kept.num_reg_images() == 19
+    assert [record.getMessage() for record in caplog.records] == [
+        f"left out, off the camera's smooth path: {names[12]}"
+    ]
+    true = 5 * np.array([np.cos(0.14), np.sin(0.14), 0.3])
+    assert np.linalg.norm(kept.find_image_with_name(names[7]).projection_center() - true) < 1e-4
 
 
 @needs_colmap

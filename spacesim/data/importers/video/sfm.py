@@ -115,7 +115,7 @@ def reconstruct(
     whole = partial(_whole, colmap, database, folder, workspace, focal, strict, distorted)
     models[0] = whole(models[0])
     if times is not None:
-        models[0] = _on_path(colmap, models[0], dict(zip(names, times, strict=True)), whole)
+        models[0] = on_path(colmap, models[0], dict(zip(names, times, strict=True)), whole)
     model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -302,7 +302,7 @@ def _whole(
     return found
 
 
-def _on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], whole: Callable[[Any], Any]) -> Any:
+def on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], whole: Callable[[Any], Any]) -> Any:
     """The model of a film with cameras that stray begun anew from its path, or left out. times: of pictures by name"""
     astray = _strays(model, times)
     if any([_begin_anew(colmap, model, name, position) for name, position in astray.items()]):  # all of them
