@@ -112,10 +112,13 @@ def reconstruct(
             _adjust(colmap, models[0], focal is None, distorted)
     if not models:
         raise InputError(f"{folder.name}: {_why_none(matches)}")
-    whole = partial(_whole, colmap, database, folder, workspace, focal, strict, distorted)
-    models[0] = whole(models[0])
+    models[0] = _triangulated(
+        colmap, database, folder, workspace, _mapping(colmap, focal, strict, distorted), models[0]
+    )
+    adjust = partial(_adjust, colmap, models[0], focal is None, distorted)
+    adjust()
     if times is not None:
-        models[0] = on_path(colmap, models[0], dict(zip(names, times, strict=True)), whole)
+        put_on_path(colmap, models[0], dict(zip(names, times, strict=True)), adjust)
     model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -277,42 +280,33 @@ def _mapping(colmap: ModuleType, focal: float | None, strict: float, distorted: 
     return options
 
 
-def _whole(
-    colmap: ModuleType,
-    database: Path,
-    folder: Path,
-    workspace: Path,
-    focal: float | None,
-    strict: float,
-    distorted: bool,
-    model: Any,
-) -> Any:
-    """The model with its points made anew, and adjusted: tracks that broke while poses were worse are whole, and hold
-    together parts of a film that stood askew."""
-    options = _mapping(colmap, focal, strict, distorted)
+def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: Path, options: Any, model: Any) -> Any:
+    """The model with its points made anew: tracks that broke while poses were worse are whole, and hold together
+    parts of a film that stood askew."""
     output = workspace / "triangulated"
-    output.mkdir(exist_ok=True)
-    found = _run(
+    output.mkdir()
+    return _run(
         colmap,
         lambda token: colmap.triangulate_points(
             model, database, folder, output, options=options, cancellation_token=token
         ),
     )
-    _adjust(colmap, found, focal is None, distorted)
-    return found
 
 
-def on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], whole: Callable[[Any], Any]) -> Any:
-    """The model of a film with cameras that stray begun anew from its path, or left out. times: of pictures by name"""
+def put_on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], adjust: Callable[[], object]) -> None:
+    """Begin those cameras of a film's model anew from its path that stray (`model.strays`), and take out of it, with a
+    warning, those that stray again.
+
+    times: of the pictures by their names, as `reconstruct` has them; adjust: adjusts the whole model
+    """
     astray = _strays(model, times)
     if any([_begin_anew(colmap, model, name, position) for name, position in astray.items()]):  # all of them
-        model = whole(model)
+        adjust()
     lost = [name for name in _strays(model, times) if name in astray]
     for name in lost:
         model.deregister_frame(model.find_image_with_name(name).frame_id)
     if lost:
         _log.warning("left out, off the camera's smooth path: %s", ", ".join(lost))
-    return model
 
 
 def _strays(model: Any, times: Mapping[str, float]) -> dict[str, Array]:
@@ -328,6 +322,8 @@ def _begin_anew(colmap: ModuleType, model: Any, name: str, position: Array) -> b
     as the one it has; whether it does."""
     image = model.find_image_with_name(name)
     features = image.get_observation_points2D()
+    if len(features) < 3:
+        return False
     pixels = np.array([feature.xy for feature in features])
     points = np.array([model.points3D[feature.point3D_id].xyz for feature in features])
     rays = np.column_stack([image.camera.cam_from_img(pixels), np.ones(len(pixels))])
