@@ -108,7 +108,9 @@ def import_video(
                 name = f"frame_{number:06d}.png"
                 write_png(folder / "pictures" / name, _scaled(frame.picture, settings.height), durable=False)
                 keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
-        return _import(src, out, folder, keys, True, settings, source, tell, {"frames_of_video": len(seen.motion)})
+        return _import(
+            src, out, folder, keys, chosen.tolist(), settings, source, tell, {"frames_of_video": len(seen.motion)}
+        )
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:
@@ -136,7 +138,7 @@ def import_images(src: Path, out: Path, *, progress: Progress | None = None, **o
                 expected = f"{size[1]}x{size[0]} pixels as the first picture has"
                 raise InputError(f"{path}: expected {expected}, found {pixels.shape[1]}x{pixels.shape[0]}")
             write_png(folder / "pictures" / name, _scaled(pixels, settings.height), durable=False)
-        return _import(src, out, folder, {name: {} for name in names}, False, settings, source, tell, {})
+        return _import(src, out, folder, {name: {} for name in names}, None, settings, source, tell, {})
 
 
 def _import(
@@ -144,14 +146,14 @@ def _import(
     out: Path,
     folder: Path,
     keys: Mapping[str, Mapping[str, JsonValue]],
-    ordered: bool,
+    times: Sequence[float] | None,
     settings: ImportOptions,
     source: dict[str, JsonValue],
     tell: StageProgress,
     facts: dict[str, JsonValue],
 ) -> Dataset:
     """Of pictures in folder/pictures, all of one size. keys: of each picture by its name, what transforms.json has of
-    it besides"""
+    it besides; times: of a film's, see `reconstruct`"""
     names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
     focal = None if settings.fov is None else 0.5 * width / math.tan(math.radians(0.5 * settings.fov))
@@ -163,7 +165,7 @@ def _import(
     work = folder / "work"
     work.mkdir()
     try:
-        reconstruction = reconstruct(shown, names, (width, height), work, features, focal, ordered, tell)
+        reconstruction = reconstruct(shown, names, (width, height), work, features, focal, times, tell)
     except InputError as error:
         raise InputError(str(error).replace(f"{shown.name}: ", f"{src}: ", 1)) from None
     extent, scale_from = None, None if settings.distance is None else "distance"

@@ -7,7 +7,7 @@ that Ctrl-C is heard: it ends them through pycolmap's own token.
 import importlib
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,10 +15,11 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.geometry import Array, degrees_between
-from spacesim.data.importers.video.model import SfmModel
+from spacesim.data.geometry import Array, degrees_between, normalize
+from spacesim.data.importers.video.model import SfmModel, strays
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
@@ -35,6 +36,7 @@ _STRICT = 480  # pixels of the longer side for which a match may be off by one; 
 _SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
 _BETTER = 0.95  # share of the error that may be left, for distortion to be believed
+_AS_GOOD = 1.1  # times the cost of a pose off the film's path that one on it may have
 _OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
 
 _log = logging.getLogger(__name__)
@@ -59,14 +61,15 @@ def reconstruct(
     workspace: Path,
     masks: Path | None = None,
     focal: float | None = None,
-    ordered: bool = False,
+    times: Sequence[float] | None = None,
     progress: Progress | None = None,
 ) -> SfmModel:
     """Poses of the pictures folder/NAME, all of one camera and of `size` (width, height).
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
-    ordered: the pictures are in time order
+    times: of the pictures in their film, rising, of any unit: cameras off its smooth path (`model.strays`) are then
+    begun anew from it, and left out with a warning where that fails
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
@@ -88,7 +91,7 @@ def reconstruct(
         reader.camera_params = f"{focal},{size[0] / 2},{size[1] / 2},0"
     _find_features(colmap, database, folder, names, reader, report)
     strict = min(max(max(size) / _STRICT, 1.0), 4.0)
-    _match(colmap, database, len(names), ordered, strict, report)
+    _match(colmap, database, len(names), times is not None, strict, report)
     matches = _matches(colmap, database)
     if matches.features < _LEAST_FEATURES:
         raise InputError(
@@ -112,7 +115,10 @@ def reconstruct(
     models[0] = _triangulated(
         colmap, database, folder, workspace, _mapping(colmap, focal, strict, distorted), models[0]
     )
-    _adjust(colmap, models[0], focal is None, distorted)
+    adjust = partial(_adjust, colmap, models[0], focal is None, distorted)
+    adjust()
+    if times is not None:
+        put_on_path(colmap, models[0], dict(zip(names, times, strict=True)), adjust)
     model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -285,6 +291,58 @@ def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: P
             model, database, folder, output, options=options, cancellation_token=token
         ),
     )
+
+
+def put_on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], adjust: Callable[[], object]) -> None:
+    """Begin those cameras of a film's model anew from its path that stray (`model.strays`), and take out of it, with a
+    warning, those that stray again.
+
+    times: of the pictures by their names, as `reconstruct` has them; adjust: adjusts the whole model
+    """
+    astray = _strays(model, times)
+    if any([_begin_anew(colmap, model, name, position) for name, position in astray.items()]):  # all of them
+        adjust()
+    lost = [name for name in _strays(model, times) if name in astray]
+    for name in lost:
+        model.deregister_frame(model.find_image_with_name(name).frame_id)
+    if lost:
+        _log.warning("left out, off the camera's smooth path: %s", ", ".join(lost))
+
+
+def _strays(model: Any, times: Mapping[str, float]) -> dict[str, Array]:
+    """Where cameras that stray would be by their neighbours, by their pictures' names."""
+    found = _model(model, [])
+    distances = np.array([_depths(found, k) for k in range(len(found.names))])
+    places = strays(found.positions, np.array([times[name] for name in found.names]), distances)
+    return {found.names[k]: place for k, place in places.items()}
+
+
+def _begin_anew(colmap: ModuleType, model: Any, name: str, position: Array) -> bool:
+    """Adjust one pose from a position, turned as its features are seen from there, and keep it if it fits about as well
+    as the one it has; whether it does."""
+    image = model.find_image_with_name(name)
+    features = image.get_observation_points2D()
+    if len(features) < 3:
+        return False
+    pixels = np.array([feature.xy for feature in features])
+    points = np.array([model.points3D[feature.point3D_id].xyz for feature in features])
+    rays = np.column_stack([image.camera.cam_from_img(pixels), np.ones(len(pixels))])
+    turn = Rotation.align_vectors(normalize(rays), normalize(points - position))[0].as_matrix()
+    options = colmap.AbsolutePoseRefinementOptions()
+    options.loss_function_scale, options.gradient_tolerance = _SOFT, 1e-6
+    start = colmap.Rigid3d(colmap.Rotation3d(turn), -turn @ position)
+    found = colmap.refine_absolute_pose(start, pixels, points, np.ones(len(pixels), bool), image.camera, options)
+    if found is None:
+        return False
+
+    def cost(pose: Any) -> float:
+        off = image.camera.img_from_cam(pose * points) - pixels
+        return float(np.log1p(np.square(off).sum(axis=1) / _SOFT**2).sum())  # Cauchy's, as that of `_adjust`
+
+    if not cost(found["cam_from_world"]) <= _AS_GOOD * cost(image.cam_from_world()):
+        return False
+    image.frame.rig_from_world = found["cam_from_world"]
+    return True
 
 
 def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
