@@ -38,19 +38,19 @@ uint16 [H, W]."""
 Part = Path | Callable[[], np.ndarray | None]
 """A `Picture` beside that of a frame; None of what turns out not to be there."""
 Progress = Callable[[int, int, str], None]
-"""Called with how many pictures are written, of how many, and the name of the last."""
+"""Called with how many pictures are written (of work in stages: percent), of how many, and the name of the last."""
 
 
 class StageProgress:
-    """Tells a `Progress` of stages as parts of one whole."""
+    """Tells a `Progress` of stages as parts of one whole, in percent."""
 
     def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
         self.progress, self.stages = progress, stages
 
     def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
         if self.progress is not None:
-            part = 100 * (self.stages.index(stage) + done / max(total, 1))
-            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
+            part = (self.stages.index(stage) + done / max(total, 1)) / len(self.stages)
+            self.progress(round(100 * part), 100, f"{stage} {detail}".rstrip())
 
     def write(self, done: int, total: int, name: str) -> None:
         """What `write_dataset` tells, of the last stage."""
