@@ -47,7 +47,7 @@ def import_colmap(
 
     Poses are taken as they are, in the model's axes and units. Of several models the largest is taken; images without
     a file are left out; both are logged. Raises InputError where there is no model, as `read_model` does, where no
-    image has a file, and where a picture has another shape than its camera.
+    image has a file, where a picture has another shape than its camera, and where no mask shows anything.
     """
     folder = _find_model(src)
     model = read_model(folder)

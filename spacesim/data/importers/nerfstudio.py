@@ -77,7 +77,8 @@ def import_nerfstudio(
     masked: what black in masks means, see `masks.MASKED`; None is "unknown" of mask_path, else "empty"
     depth_unit: metres a step of the depth files; None is what transforms.json says, else a millimetre
 
-    Truth beyond these stays behind. Raises InputError as `read_dataset` does, and where a file is broken.
+    Truth beyond these stays behind. Raises InputError as `read_dataset` does, where a file is broken, where depth has
+    another shape than its picture, and where no mask or no silhouette shows anything.
     """
     path = src / "transforms.json" if src.is_dir() else src
     extras = _Extras()

@@ -106,8 +106,9 @@ def import_speedplus(
     masks: a folder of them, "auto": cut out by `carving`, "none": the background stays; None: the domain's own folder
     `masks`, where there is none "auto", but of fewer than 20 pictures and of those with alpha "none". masked: one of
     `MASKED`.
-    Frames without a picture are skipped, with one warning. Raises InputError for labels or a camera that are missing or
-    broken, pictures of another size than the camera's, and where no frame is left.
+    Frames without a picture are skipped, with one warning; a picture in which "auto" finds nothing is unknown.
+    Raises InputError for labels or a camera that are missing or broken, pictures of another size than the camera's, and
+    where no frame is left or no mask shows anything.
     """
     expect(domain in DOMAINS, "domain", f"one of {', '.join(DOMAINS)}", domain)
     expect(max_distance is None or 0 < max_distance < math.inf, "max_distance", "metres above 0", max_distance)

@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.importers.kinds import import_dataset
+from spacesim.data.importers.lenses import LENS_MODELS, Lens
+from spacesim.data.importers.pictures import FrameImporter, SourceView
 from spacesim.data.store import find_unreadable_files
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 130.0
@@ -93,6 +95,17 @@ def test_a_picture_in_which_nothing_is_found_is_unknown(made, tmp_path, caplog, 
     assert sum(frame.silhouette_path is not None for frame in data.frames) == COUNT - 1
     assert find_unreadable_files(data.root) == []
     assert f"masks: nothing is found in 1 of {COUNT} pictures, 05" in caplog.text
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+def test_a_guess_that_shows_nothing_leaves_alpha(tmp_path, guessed):
+    Image.new("RGBA", (16, 12), (10, 20, 30, 200)).save(tmp_path / "a.png")
+    lens = Lens(LENS_MODELS[6], 16, 12, (20.0, 20.0, 8.0, 6.0, *(0.0,) * 8))
+    view = SourceView("a", tmp_path / "a.png", np.eye(4), lens, lambda: np.zeros((12, 16), bool))
+    frame = FrameImporter(guessed=guessed).frame(view)
+    assert callable(frame.picture)
+    assert (frame.picture()[..., 3] == (200 if guessed else 0)).all()
+    assert (frame.mask is not None and not frame.mask().any()) == guessed
 
 
 def test_few_pictures_stay_as_they_are(made, tmp_path, caplog):
