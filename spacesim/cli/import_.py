@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
     chosen = {option.name: getattr(options, option.name) for option in KINDS[options.kind].options}
     given = {name: value for name, value in chosen.items() if value is not None}
-    with show_progress("import", "pictures") as report:
+    with show_progress("import", "steps") as report:
         dataset = import_dataset(options.kind, options.src, options.out, report, **given)
     points = "" if dataset.ply_file_path is None else ", with points to start from"
     interrupts.print_output(

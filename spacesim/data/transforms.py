@@ -390,12 +390,12 @@ def _listed(source: Path, names: object, paths: list[str], missing: tuple[str, .
     missing."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{source}: expected lists of file paths as train_filenames and the like")
-    listed = {_relative(source, name) for name in names}
-    listed = {name if name in paths else f"{name}.png" for name in listed.difference(missing)}
-    unknown = sorted(listed.difference(paths))
+    named = {_relative(source, name) for name in names}.difference(missing)
+    listed = {name: name if name in paths else f"{name}.png" for name in named}
+    unknown = sorted(name for name, path in listed.items() if path not in paths)
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
-    return listed
+    return set(listed.values())
 
 
 def _exists(path: Path) -> bool:

@@ -10,7 +10,7 @@ is where the object is; colours around its outline decide the rest. What is dark
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +80,8 @@ def mask_makers(
         _log.warning("masks: %d pictures are few to cut the object out by, it takes %d", len(views), FEW)
     centre = focus_of(np.array([view.world_from_camera for view in views])) if centre is None else centre
     shape = find_shape(views, centre, lambda done, total: tell("cut out", done, total))
-    return {name: partial(cut_out, view, shape) for name, view in pictures.items()}
+    cut = lru_cache(maxsize=1)(lambda name: cut_out(pictures[name], shape))  # a frame asks for its mask twice
+    return {name: partial(cut, name) for name in pictures}
 
 
 def find_shape(pictures: Sequence[PosedPicture], centre: Array, progress: Callable[[int, int], None]) -> Shape:

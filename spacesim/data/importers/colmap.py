@@ -17,7 +17,7 @@ from spacesim.data.importers.colmap_model import (
     read_model,
 )
 from spacesim.data.importers.importer import Importer, Option
-from spacesim.data.importers.masks import AUTO, mask_options
+from spacesim.data.importers.masks import AUTO, WatchedMasks, mask_options
 from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
 from spacesim.data.importers.writing import Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Dataset
@@ -47,7 +47,7 @@ def import_colmap(
 
     Poses are taken as they are, in the model's axes and units. Of several models the largest is taken; images without
     a file are left out; both are logged. Raises InputError where there is no model, as `read_model` does, where no
-    image has a file, and where a picture has another shape than its camera.
+    image has a file, where a picture has another shape than its camera, and where no mask shows anything.
     """
     folder = _find_model(src)
     model = read_model(folder)
@@ -58,10 +58,10 @@ def import_colmap(
     lenses = {image.name: fitted(model.cameras[image.camera], paths[image.name]) for image in used}
     pictures = {i.name: PosedPicture(paths[i.name], i.world_from_camera, lenses[i.name]) for i in used}
     tell = StageProgress(progress, ("cut out", "write") if str(masks) == AUTO else ("write",))
-    makers, maker = mask_makers(masks, pictures, tell), FrameImporter(masked)
+    watched, maker = WatchedMasks(mask_makers(masks, pictures, tell)), FrameImporter(masked, str(masks) == AUTO)
     frames = []
     for name, (key, picture) in zip(frame_names(list(pictures)), pictures.items(), strict=True):
-        view = SourceView(name, picture.path, picture.world_from_camera, picture.lens, makers.get(key))
+        view = SourceView(name, picture.path, picture.world_from_camera, picture.lens, watched.makers.get(key))
         frames.append(maker.frame(view))
     source = {
         "kind": "colmap",
@@ -70,7 +70,10 @@ def import_colmap(
         "masks": None if masks is None else str(masks),
         "masked": masked,
     }
-    return write_dataset(out, frames, None, source, _start_points(folder, model, connected), progress=tell.write)
+    points = _start_points(folder, model, connected)
+    dataset = write_dataset(out, frames, None, source, points, progress=tell.write)
+    watched.warn()
+    return dataset
 
 
 def _find_model(src: Path) -> Path:

@@ -1,7 +1,8 @@
 """Masks from a folder, made by hand or by another program, and what they say of the pixels that they cut off."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -18,6 +19,35 @@ AUTO, NO_MASKS = "auto", "none"  #: in place of a folder of masks
 NO_OBJECT = "masks: expected an object in the pictures, found none; give masks, or masks none"
 
 _log = logging.getLogger(__name__)
+
+
+def check_shown(empty: Sequence[str], count: int, sentence: str = NO_OBJECT) -> None:
+    """Log how many of `count` masks show nothing. empty: names of their pictures. Raises InputError with `sentence`
+    where all do."""
+    if count and len(empty) == count:
+        raise InputError(sentence)
+    if empty:
+        _log.warning("masks: nothing is found in %d of %d pictures, %s first", len(empty), count, empty[0])
+
+
+class WatchedMasks:
+    """What makes masks [H, W] bool, by the names of pictures, and which of them show nothing. Raises InputError where
+    none shows anything."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], np.ndarray]]) -> None:
+        self.makers = {name: partial(self._make, name, make) for name, make in makers.items()}
+        self._shows: dict[str, bool] = {}
+        if not any(make().any() for make in self.makers.values()):
+            self.warn()
+
+    def warn(self) -> None:
+        """Of those made by now, as `check_shown` does."""
+        check_shown([name for name, shows in self._shows.items() if not shows], len(self._shows))
+
+    def _make(self, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+        mask = make()
+        self._shows[name] = bool(mask.any())
+        return mask
 
 
 def mask_options(default: str, masked: str = "default: empty") -> tuple[Option, Option]:
@@ -112,12 +142,17 @@ def read_silhouette(path: Path, width: int, height: int) -> np.ndarray:
     return _scaled(path, (pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)) > 0, width, height)
 
 
+def check_shape(path: Path, found_width: int, found_height: int, width: int, height: int) -> None:
+    """Raise InputError where what belongs to a picture of width x height pixels has other proportions."""
+    if abs(found_width * height - found_height * width) > max(found_width, found_height, width, height):
+        expected = f"{width}x{height} pixels, or a multiple or fraction, as its picture"
+        raise InputError(f"{path}: expected {expected}, found {found_width}x{found_height}")
+
+
 def _scaled(path: Path, white: np.ndarray, width: int, height: int) -> np.ndarray:
     mask_height, mask_width = white.shape
     if (mask_width, mask_height) == (width, height):
         return white
-    if abs(mask_width * height - mask_height * width) > max(mask_width, mask_height, width, height):
-        expected = f"{width}x{height} pixels, or a multiple or fraction, as its picture"
-        raise InputError(f"{path}: expected {expected}, found {mask_width}x{mask_height}")
+    check_shape(path, mask_width, mask_height, width, height)
     resized = PillowImage.fromarray(white.astype(np.uint8)).resize((width, height), PillowImage.Resampling.NEAREST)
     return np.asarray(resized) > 0

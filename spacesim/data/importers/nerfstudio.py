@@ -23,7 +23,16 @@ from spacesim.data.images import read_png
 from spacesim.data.importers.carving import PosedPicture, mask_makers
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens, LensModel
-from spacesim.data.importers.masks import AUTO, MASKED, mask_options, read_mask
+from spacesim.data.importers.masks import (
+    AUTO,
+    MASKED,
+    WatchedMasks,
+    check_shape,
+    check_shown,
+    mask_options,
+    read_mask,
+    read_silhouette,
+)
 from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
 from spacesim.data.importers.writing import ImportedFrame, Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Dataset, Frame
@@ -68,7 +77,8 @@ def import_nerfstudio(
     masked: what black in masks means, see `masks.MASKED`; None is "unknown" of mask_path, else "empty"
     depth_unit: metres a step of the depth files; None is what transforms.json says, else a millimetre
 
-    Truth beyond these stays behind. Raises InputError as `read_dataset` does, and where a file is broken.
+    Truth beyond these stays behind. Raises InputError as `read_dataset` does, where a file is broken, where depth has
+    another shape than its picture, and where no mask or no silhouette shows anything.
     """
     path = src / "transforms.json" if src.is_dir() else src
     extras = _Extras()
@@ -144,7 +154,7 @@ def _unit(path: Path, name: str, values: JsonMapping) -> float:
 def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, progress: Progress | None) -> Dataset:
     masks, masked = source["masks"], source["masked"]
     expect(masked in MASKED, "masked", f"one of {', '.join(MASKED)}", masked)
-    maker, depths = FrameImporter(masked), _DepthReader(_common_unit(dataset.root, extras))
+    maker, depths = FrameImporter(masked, masks == AUTO), _DepthReader(_common_unit(dataset.root, extras))
     paths = _below_one_folder(dataset.root, [frame.file_path for frame in dataset.frames])
     names = dict(zip(dataset.frames, frame_names(paths), strict=True))
 
@@ -155,14 +165,26 @@ def _write(dataset: Dataset, extras: _Extras, out: Path, source: JsonMapping, pr
         posed = {keys[frame]: PosedPicture(v.path, v.world_from_camera, v.lens) for frame, v in views.items()}
         makers = mask_makers(masks, posed, tell)
         views = {frame: replace(view, mask=makers.get(keys[frame])) for frame, view in views.items()}
+    _check_silhouettes(dataset.root, [v for v in views.values() if v.mask is None or masked == "unknown"])
+    watched = WatchedMasks({view.name: view.mask for view in views.values() if view.mask is not None})
+    views = {frame: replace(view, mask=watched.makers.get(view.name)) for frame, view in views.items()}
 
     def make(frames: Iterable[Frame]) -> list[ImportedFrame]:
         return [maker.frame(views[frame]) for frame in frames]
 
     points = None if dataset.ply_file_path is None else read_points(dataset.root / dataset.ply_file_path)
-    return write_dataset(
+    written = write_dataset(
         out, make(dataset.train), make(dataset.test), source, points, progress=tell.write, depth_unit=depths.unit
     )
+    watched.warn()
+    return written
+
+
+def _check_silhouettes(root: Path, views: Iterable[SourceView]) -> None:
+    """As `check_shown` does."""
+    shows = {v.name: read_silhouette(v.silhouette, v.lens.width, v.lens.height).any() for v in views if v.silhouette}
+    sentence = f"{root}: expected an object in the silhouettes, found none in all {len(shows)}; give masks"
+    check_shown([name for name, shown in shows.items() if not shown], len(shows), sentence)
 
 
 def _below_one_folder(root: Path, paths: Sequence[str]) -> list[str]:
@@ -233,8 +255,10 @@ class _DepthReader:
 
     def read(self, path: Path, unit: float, width: int, height: int) -> np.ndarray:
         """[H, W] uint16 steps of a picture, or an array of NumPy's (.npy), in steps of `unit` metres; another size is
-        brought to width x height by the nearest pixel. 0 where there is none or it is beyond 16 bits."""
+        brought to width x height by the nearest pixel. 0 where there is none or it is beyond 16 bits. Raises InputError
+        for one of another shape."""
         steps = _read_steps(path)
+        check_shape(path, steps.shape[1], steps.shape[0], width, height)
         if steps.shape != (height, width):
             rows = (np.arange(height) + 0.5) * steps.shape[0] / height
             columns = (np.arange(width) + 0.5) * steps.shape[1] / width

@@ -46,6 +46,7 @@ class FrameImporter:
     camera in its middle, and what it does not image is unknown."""
 
     masked: str = "empty"  #: what black in a mask means, see `masks.MASKED`
+    guessed: bool = False  #: of masks that show nothing, nothing is known either
     _resampling: Callable[[Lens], Resampling] = field(init=False)  # of a lens: two are kept
     _seen_share: Callable[[Lens], float] = field(init=False)
     _warned: set[Lens] = field(init=False, default_factory=set)
@@ -65,7 +66,8 @@ class FrameImporter:
         resampled = distortion is None
         self._warn_of_blindness(lens, view.path)
         cut_out = view.mask is not None and empty and has_alpha(view.path)
-        unknown = (view.mask is not None and not empty) or (resampled and self._seen_share(lens) < 1)
+        unknown = view.mask is not None and (self.guessed or not empty)
+        unknown = unknown or (resampled and self._seen_share(lens) < 1)
         in_file = view.mask is not None and empty and not cut_out
         made = in_file or (
             view.silhouette is not None and (resampled or image_size(view.silhouette) != (lens.width, lens.height))
@@ -110,29 +112,41 @@ class FrameImporter:
             return np.rint(255 * shown[..., 0] if shown.shape[2] == 1 else 255 * shown).astype(np.uint8)
         alpha = values[..., 3]
         if view.mask is not None and self.masked == "empty":
-            alpha = alpha * view.mask()
+            found = self._found(view)
+            alpha = alpha if found is None else alpha * found
         image = Image(values[..., :3], alpha, np.ones(alpha.shape, bool))
         if source is not None:
             image = resample(image, source)
         return np.rint(255 * np.concatenate([image.rgb, image.alpha[..., None]], axis=-1)).astype(np.uint8)
 
-    def _silhouette(self, view: SourceView) -> np.ndarray:
-        """255 object, 0 none."""
+    def _found(self, view: SourceView) -> np.ndarray | None:
+        """[H, W] bool of the view's mask; None of a guess that shows nothing."""
+        assert view.mask is not None
+        mask = view.mask()
+        return mask if mask.any() or not self.guessed else None
+
+    def _silhouette(self, view: SourceView) -> np.ndarray | None:
+        """255 object, 0 none; None where it is not known."""
+        known: np.ndarray | None
         if view.mask is not None and self.masked == "empty":
-            known = view.mask()
+            known = self._found(view)
         else:
             assert view.silhouette is not None
             known = read_silhouette(view.silhouette, view.lens.width, view.lens.height)
-        return self._labels(view, np.where(known, 255, 0).astype(np.uint8))
+        return None if known is None else self._labels(view, np.where(known, 255, 0).astype(np.uint8))
 
-    def _known(self, view: SourceView) -> np.ndarray:
-        """255 counts, 0 unknown."""
+    def _known(self, view: SourceView) -> np.ndarray | None:
+        """255 counts, 0 unknown; None where a guess leaves nothing unknown."""
         known = np.ones((view.lens.height, view.lens.width), bool)
         if view.mask is not None and self.masked == "unknown":
             known = view.mask()
+        elif view.mask is not None and self.guessed:
+            known &= self._found(view) is not None
         if view.lens.distortion is None:
             source = self._resampling(view.lens)
             known = source.inside & (source.linear(known.astype(np.float32)) > 0.999)  # no unknown pixel takes part
+        if self.guessed and self.masked == "empty" and known.all():
+            return None
         return np.where(known, 255, 0).astype(np.uint8)
 
     def _depth(self, read: Callable[[], np.ndarray], view: SourceView) -> np.ndarray:

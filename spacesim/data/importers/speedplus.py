@@ -29,7 +29,7 @@ from spacesim.data.images import has_alpha, image_size, read_png
 from spacesim.data.importers.carving import FEW, PosedPicture, mask_makers
 from spacesim.data.importers.importer import Importer, Option
 from spacesim.data.importers.lenses import LENS_MODELS, Lens
-from spacesim.data.importers.masks import AUTO, MASKED, NO_MASKS, mask_options
+from spacesim.data.importers.masks import AUTO, MASKED, NO_MASKS, WatchedMasks, mask_options
 from spacesim.data.importers.writing import ImportedFrame, Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.transforms import FARTHEST
@@ -106,8 +106,9 @@ def import_speedplus(
     masks: a folder of them, "auto": cut out by `carving`, "none": the background stays; None: the domain's own folder
     `masks`, where there is none "auto", but of fewer than 20 pictures and of those with alpha "none". masked: one of
     `MASKED`.
-    Frames without a picture are skipped, with one warning. Raises InputError for labels or a camera that are missing or
-    broken, pictures of another size than the camera's, and where no frame is left.
+    Frames without a picture are skipped, with one warning; a picture in which "auto" finds nothing is unknown.
+    Raises InputError for labels or a camera that are missing or broken, pictures of another size than the camera's, and
+    where no frame is left or no mask shows anything.
     """
     expect(domain in DOMAINS, "domain", f"one of {', '.join(DOMAINS)}", domain)
     expect(max_distance is None or 0 < max_distance < math.inf, "max_distance", "metres above 0", max_distance)
@@ -119,9 +120,15 @@ def import_speedplus(
     intrinsics = _read_camera(src, lists[0])
     splits = [_read_labels(path) for path in lists]
     labelled = sum(map(len, splits))
+    if not splits[0]:
+        raise InputError(f"{lists[0]}: expected labels of pictures, found none")
     if max_distance is not None:
         splits = [[one for one in labels if np.linalg.norm(one.position) <= max_distance] for labels in splits]
     near = sum(map(len, splits))
+    if near < labelled:
+        _log.info(
+            "%s: %d of %d pictures are farther than %g m, left out", pictures, labelled - near, labelled, max_distance
+        )
     splits = [[one for one in labels if (pictures / one.filename).is_file()] for labels in splits]
     there = sum(map(len, splits))
     if not splits[0]:
@@ -143,14 +150,20 @@ def import_speedplus(
     poses = {one.filename: one.world_from_camera for labels in splits for one in labels}
     posed = {name: PosedPicture(pictures / name, pose, intrinsics.lens) for name, pose in poses.items()}
     tell = StageProgress(progress, ("cut out", "write") if str(chosen) == AUTO else ("write",))
-    makers = mask_makers(chosen, posed, tell, np.zeros(3))
+    watched = WatchedMasks(mask_makers(chosen, posed, tell, np.zeros(3)))
     names = dict(zip(files, frame_names(files), strict=True))
-    maker = _FrameMaker(pictures, names, intrinsics, size, makers, masked)
+    maker = _FrameMaker(pictures, names, intrinsics, size, watched.makers, masked, str(chosen) == AUTO)
     train, test = (list(map(maker.frame, labels)) for labels in [*splits, []][:2])
     options = {"domain": domain, "max_distance": max_distance, "count": count, "scale": scale, "seed": seed}
-    options |= {"masks": None if masks is None else str(masks), "masked": masked}
+    options |= {"masks": str(chosen), "masked": masked}
     source = {"kind": "speedplus", "source": str(src), **options}
-    return write_dataset(out, train, test or None, source, progress=tell.write)
+    if str(chosen) == AUTO:
+        _log.info("masks: cut out of the pictures; look at %s", out / ("silhouette" if masked == "empty" else "mask"))
+    elif str(chosen) != NO_MASKS:
+        _log.info("masks: those of %s", chosen)
+    dataset = write_dataset(out, train, test or None, source, progress=tell.write)
+    watched.warn()
+    return dataset
 
 
 def _check_size(path: Path, intrinsics: _Intrinsics) -> None:
@@ -279,6 +292,7 @@ class _FrameMaker:
     size: tuple[int, int]  #: (width, height) that pictures get
     masks: Mapping[str, Callable[[], np.ndarray]]  #: what makes them, of file names
     masked: str
+    guessed: bool  #: of masks that show nothing, nothing is known either
 
     def frame(self, label: _Label) -> ImportedFrame:
         """Pictures are read when it is written."""
@@ -290,10 +304,20 @@ class _FrameMaker:
             picture=path if self.size == full else partial(_resized, path, self.size),
             camera=self.intrinsics.camera(label.world_from_camera, self.size),
             distortion=self.intrinsics.distortion,
-            silhouette=made if self.masked == "empty" else None,
-            mask=made if self.masked == "unknown" else None,
+            silhouette=None if made is None or self.masked != "empty" else partial(self._silhouette, made),
+            mask=None if made is None or not (self.guessed or self.masked == "unknown") else partial(self._known, made),
             keys={"q_vbs2tango_true": label.quaternion, "r_Vo2To_vbs_true": label.position},
         )
+
+    def _silhouette(self, make: Callable[[], np.ndarray]) -> np.ndarray | None:
+        """None where it is not known."""
+        made = make()
+        return made if made.any() or not self.guessed else None
+
+    def _known(self, make: Callable[[], np.ndarray]) -> np.ndarray | None:
+        """None where a guess leaves nothing unknown."""
+        made = make()
+        return made if self.masked == "unknown" or not made.any() else None
 
 
 def _resized(path: Path, size: tuple[int, int]) -> np.ndarray:

@@ -35,20 +35,22 @@ _PARTS = {"silhouette": "silhouette_path", "mask": "mask_path", "depth": "depth_
 Picture = Path | Callable[[], np.ndarray]
 """A file, copied as it is, or what makes pixels when they are written: uint8 [H, W], [H, W, 3] or [H, W, 4], of depth
 uint16 [H, W]."""
+Part = Path | Callable[[], np.ndarray | None]
+"""A `Picture` beside that of a frame; None of what turns out not to be there."""
 Progress = Callable[[int, int, str], None]
-"""Called with how many pictures are written, of how many, and the name of the last."""
+"""Called with how many pictures are written (of work in stages: percent), of how many, and the name of the last."""
 
 
 class StageProgress:
-    """Tells a `Progress` of stages as parts of one whole."""
+    """Tells a `Progress` of stages as parts of one whole, in percent."""
 
     def __init__(self, progress: Progress | None, stages: Sequence[str]) -> None:
         self.progress, self.stages = progress, stages
 
     def __call__(self, stage: str, done: int, total: int, detail: str = "") -> None:
         if self.progress is not None:
-            part = 100 * (self.stages.index(stage) + done / max(total, 1))
-            self.progress(round(part), 100 * len(self.stages), f"{stage} {detail}".rstrip())
+            part = (self.stages.index(stage) + done / max(total, 1)) / len(self.stages)
+            self.progress(round(100 * part), 100, f"{stage} {detail}".rstrip())
 
     def write(self, done: int, total: int, name: str) -> None:
         """What `write_dataset` tells, of the last stage."""
@@ -67,9 +69,9 @@ class ImportedFrame:
     camera: Camera  #: pose and intrinsics of the picture as it is written
     distortion: tuple[float, ...] = ()  #: as of `Frame`
     sun: Sun | None = None  #: None where the source does not name it
-    silhouette: Picture | None = None  #: 255 object, 0 none: a pixel without is empty
-    mask: Picture | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
-    depth: Picture | None = None  #: 16 bits, steps along the optical axis, 0 none
+    silhouette: Part | None = None  #: 255 object, 0 none: a pixel without is empty
+    mask: Part | None = None  #: 255 counts, 0: ignore this pixel, nothing is known of it
+    depth: Part | None = None  #: 16 bits, steps along the optical axis, 0 none
     keys: JsonMapping = field(default_factory=dict)  #: that transforms.json has of the frame besides
 
 
@@ -103,11 +105,15 @@ def write_dataset(
         _claim(out, source)
         paths = [SOURCE]
         for number, (frame, entry) in enumerate(zip(frames, entries, strict=True), start=1):
-            paths += [_write(out, frame.picture, entry["file_path"])]
+            _write(out, frame.picture, entry["file_path"])
+            paths.append(entry["file_path"])
             for part, key in _PARTS.items():
                 picture = getattr(frame, part)
                 if picture is not None:
-                    paths.append(_write(out, picture, entry[key]))
+                    if _write(out, picture, entry[key]):
+                        paths.append(entry[key])
+                    else:
+                        del entry[key]
             if progress is not None:
                 progress(number, len(frames), frame.name)
         meta: JsonDict = {"camera_model": "OPENCV", "frames": entries}
@@ -208,8 +214,8 @@ def _entry(frame: ImportedFrame) -> JsonDict:
     return entry | dict(frame.keys)
 
 
-def _write(out: Path, picture: Picture, name: str) -> str:
-    """Write a picture below `out` under the name of transforms.json, which is returned."""
+def _write(out: Path, picture: Part, name: str) -> bool:
+    """Write a picture below `out` under the name of transforms.json; False where there is none."""
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise InputError(f"{name}: expected a name below the dataset's folder, found another")
     if isinstance(picture, Path):
@@ -217,5 +223,8 @@ def _write(out: Path, picture: Picture, name: str) -> str:
         read_png(picture, content)  # raises where it is cut off, which its header does not show
         write_bytes(out / name, content, durable=False)
     else:
-        write_png(out / name, picture(), durable=False)
-    return name
+        pixels = picture()
+        if pixels is None:
+            return False
+        write_png(out / name, pixels, durable=False)
+    return True

@@ -1,6 +1,7 @@
 """Objects cut out of pictures whose poses are known: a lit, dark-sided ball beside a bar, before clouds or nothing."""
 
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -11,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.importers.kinds import import_dataset
+from spacesim.data.importers.lenses import LENS_MODELS, Lens
+from spacesim.data.importers.pictures import FrameImporter, SourceView
+from spacesim.data.store import find_unreadable_files
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 130.0
 COUNT = 24
@@ -61,12 +65,47 @@ def overlaps(data, silhouettes):
     return {name: (mask & silhouettes[name]).sum() / (mask | silhouettes[name]).sum() for name, mask in found.items()}
 
 
-def test_speedplus_without_masks_is_cut_out(made, tmp_path):
+def test_speedplus_without_masks_is_cut_out(made, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     src, silhouettes = made
-    shares = overlaps(import_dataset("speedplus", src, tmp_path / "data"), silhouettes)
+    data = import_dataset("speedplus", src, tmp_path / "data")
+    assert f"masks: cut out of the pictures; look at {data.root / 'silhouette'}" in caplog.text
+    assert json.loads((data.root / "import.json").read_text())["masks"] == "auto"
+    assert all(frame.mask_path is None for frame in data.frames)
+    shares = overlaps(data, silhouettes)
     assert len(shares) == COUNT
     assert np.mean(list(shares.values())) > MEAN
     assert min(shares.values()) > 0.5
+
+
+@pytest.mark.parametrize("kind", ["speedplus", "nerfstudio"])
+def test_a_picture_in_which_nothing_is_found_is_unknown(made, tmp_path, caplog, kind):
+    src = made[0]
+    path = src / "synthetic/train.json"
+    labels = json.loads(path.read_text())
+    labels[5]["r_Vo2To_vbs_true"] = [40.0, 0.0, 5.0]  # far beside the picture
+    path.write_text(json.dumps(labels))
+    if kind == "nerfstudio":
+        import_dataset("speedplus", src, tmp_path / "bare", masks="none")
+        src = tmp_path / "bare"
+    data = import_dataset(kind, src, tmp_path / "data", masks="auto")
+    (lost,) = [frame for frame in data.frames if frame.mask_path is not None]
+    assert (lost.file_path, lost.silhouette_path) == ("images/05.png", None)
+    assert not read_png(data.root / lost.mask_path).any()
+    assert sum(frame.silhouette_path is not None for frame in data.frames) == COUNT - 1
+    assert find_unreadable_files(data.root) == []
+    assert f"masks: nothing is found in 1 of {COUNT} pictures, 05" in caplog.text
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+def test_a_guess_that_shows_nothing_leaves_alpha(tmp_path, guessed):
+    Image.new("RGBA", (16, 12), (10, 20, 30, 200)).save(tmp_path / "a.png")
+    lens = Lens(LENS_MODELS[6], 16, 12, (20.0, 20.0, 8.0, 6.0, *(0.0,) * 8))
+    view = SourceView("a", tmp_path / "a.png", np.eye(4), lens, lambda: np.zeros((12, 16), bool))
+    frame = FrameImporter(guessed=guessed).frame(view)
+    assert callable(frame.picture)
+    assert (frame.picture()[..., 3] == (200 if guessed else 0)).all()
+    assert (frame.mask is not None and not frame.mask().any()) == guessed
 
 
 def test_few_pictures_stay_as_they_are(made, tmp_path, caplog):

@@ -274,6 +274,15 @@ def test_pictures_without_a_mask_are_counted(tmp_path, caplog):
     assert "4 of 5 pictures have no mask and count as a whole, view 0.png first" in record.getMessage()
 
 
+def test_masks_that_show_nothing_are_refused(tmp_path):
+    for k in range(5):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        Image.new("L", (16, 12)).save(tmp_path / f"masks/view {k}.png")
+    with pytest.raises(InputError, match=r"^masks: expected an object in the pictures, found none"):
+        imported(project(tmp_path / "src"), tmp_path / "out", masks=tmp_path / "masks")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_interrupted_import_begins_anew(tmp_path):
     root = project(tmp_path / "src")
 

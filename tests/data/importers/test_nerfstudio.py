@@ -82,7 +82,7 @@ def test_a_folder_that_lacks_pictures_is_imported_and_read(tmp_path, caplog):
 
 def test_a_folder_from_windows_is_read(tmp_path):
     root = folder(tmp_path / "src", named(9, mask_path="masks/m.png"))
-    write_picture(root / "masks/m.png")
+    write_picture(root / "masks/m.png", color=(255, 255, 255))
     plain, path = ss.read_dataset(root), root / "transforms.json"
     meta = json.loads(path.read_text())
     meta["train_filenames"] = [frame["file_path"].replace("/", "\\") for frame in meta["frames"][:8]]
@@ -105,6 +105,20 @@ def test_masks_from_elsewhere_take_the_place_of_those_named(tmp_path):
     alphas = [ss.load_image(ss.read_dataset(tmp_path / "given"), frame).alpha.mean() for frame in (first, second)]
     assert sorted(alphas) == [0, 1]
     assert all(frame.mask_path is None for frame in imported(root, tmp_path / "none", masks="none").frames)
+
+
+@pytest.mark.parametrize("key", ["mask_path", "silhouette_path"])
+def test_masks_that_show_nothing_are_counted(tmp_path, caplog, key):
+    frames = [{**frame, key: f"m{k}.png"} for k, frame in enumerate(named(3))]
+    root = folder(tmp_path / "src", frames)
+    for k in range(3):
+        write_picture(root / f"m{k}.png", color=(255 * (k == 0),) * 3)
+    imported(root, tmp_path / "some")
+    assert [record.getMessage() for record in caplog.records] == ["masks: nothing is found in 2 of 3 pictures, 1 first"]
+    write_picture(root / "m0.png", color=(0, 0, 0))
+    with pytest.raises(InputError, match=r"expected an object in the (pictures|silhouettes), found none"):
+        imported(root, tmp_path / "all")
+    assert not (tmp_path / "all").exists()
 
 
 def test_fisheye_cameras_are_undistorted(tmp_path):
@@ -367,6 +381,15 @@ BROKEN = {
         "expected depth in one channel",
     ),
     "depth of words": (lambda root: np.save(root / "depth.npy", np.array(["a"])), "expected numbers, found <U1"),
+    "depth of a shape": (
+        lambda root: np.save(root / "depth.npy", np.ones((10, 10))),
+        "depth.npy: expected 16x12 pixels, or a multiple or fraction, as its picture, found 10x10",
+    ),
+    "another name": (change(train_filenames=["images/z.png"]), "its lists, found none for images/z.png"),
+    "black mask": (
+        lambda root: write_picture(root / "mask.png", color=(0, 0, 0)),
+        "masks: expected an object in the pictures, found none; give masks, or masks none",
+    ),
     "no mask": (lambda root: (root / "mask.png").unlink(), "mask.png: expected a file, found none"),
     "mask of a shape": (lambda root: write_picture(root / "mask.png", (12, 16)), "mask.png: expected 16x12 pixels, or"),
     "no points": (change(ply_file_path="a.ply"), "a.ply: expected a mesh, found none"),
@@ -386,11 +409,12 @@ def test_a_broken_folder_ends_in_one_sentence(tmp_path, case):
     damage, sentence = BROKEN[case]
     root = folder(tmp_path / "src", named(3, depth_file_path="depth.npy", mask_path="mask.png"))
     np.save(root / "depth.npy", np.ones((12, 16)))
-    write_picture(root / "mask.png")
+    write_picture(root / "mask.png", color=(255, 255, 255))
     damage(root)
     with pytest.raises(InputError) as caught:
         ss.import_dataset("nerfstudio", root, tmp_path / "out")
     assert sentence in str(caught.value)
+    assert ".png.png" not in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out/transforms.json").exists()
 

@@ -155,7 +155,9 @@ def test_published_layout(published, tmp_path):
 
 
 def test_a_distance_limit_and_a_subset(published, tmp_path, caplog):
-    near = import_speedplus(published, tmp_path / "near", max_distance=10.0, masks="none")
+    with caplog.at_level(logging.INFO):
+        near = import_speedplus(published, tmp_path / "near", max_distance=10.0, masks="none")
+    assert "20 of 40 pictures are farther than 10 m, left out" in caplog.text
     assert all(np.linalg.norm(frame.camera.position) <= 10 for frame in near.frames)
     assert (len(near.train), len(near.test)) == (16, 4)  # 2 to 9.5 m and 2 to 8 m
     few = import_speedplus(published, tmp_path / "few", max_distance=10.0, count=10)
@@ -187,7 +189,8 @@ def test_pictures_are_resized_by_means_over_areas(published, tmp_path):
     assert frame.distortion[0] == -0.2238
 
 
-def test_masks_are_silhouettes(published, tmp_path):
+def test_masks_are_silhouettes(published, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     masks = published / "synthetic/masks"
     masks.mkdir()
     shape = np.zeros(SIZE[::-1], np.uint8)
@@ -200,6 +203,8 @@ def test_masks_are_silhouettes(published, tmp_path):
         for frame in data.train[:2]:
             np.testing.assert_array_equal(read_png(data.root / frame.silhouette_path), shape[::step, ::step])
         assert data.train[2].silhouette_path is None
+    assert f"masks: those of {masks}" in caplog.text
+    assert json.loads((data.root / "import.json").read_text())["masks"] == str(masks)
     ignored = import_speedplus(published, tmp_path / "ignored", masked="unknown")
     assert ignored.train[0].silhouette_path is None
     np.testing.assert_array_equal(read_png(ignored.root / ignored.train[1].mask_path), shape)
@@ -209,6 +214,19 @@ def test_masks_are_silhouettes(published, tmp_path):
     data = import_speedplus(published, tmp_path / "other", masks=elsewhere)
     np.testing.assert_array_equal(read_png(data.root / data.train[1].silhouette_path), 255 - shape)
     assert data.train[0].silhouette_path is None
+
+
+def test_masks_that_show_nothing_are_counted(published, tmp_path, caplog):
+    masks = published / "synthetic/masks"
+    masks.mkdir()
+    for k in range(3):
+        PillowImage.new("L", SIZE, 255 * (k == 0)).save(masks / f"img{k:06d}.png")
+    import_speedplus(published, tmp_path / "some")
+    assert "masks: nothing is found in 2 of 3 pictures, img000001.jpg first" in caplog.text
+    PillowImage.new("L", SIZE).save(masks / "img000000.png")
+    with pytest.raises(InputError, match=r"^masks: expected an object in the pictures, found none"):
+        import_speedplus(published, tmp_path / "all")
+    assert not (tmp_path / "all").exists()
 
 
 def test_missing_pictures_are_skipped_with_one_warning(published, tmp_path, caplog):
@@ -258,7 +276,7 @@ def edit(path: Path, change) -> None:
         ("synthetic/train.json", lambda v: v[2].update(filename="../../train.json"), "file name below"),
         ("synthetic/train.json", lambda v: v[2].update(filename=7), "file name below"),
         ("synthetic/train.json", lambda v: v[2].update(filename="img000000.jpg"), "each image once"),
-        ("synthetic/train.json", lambda v: v.clear(), "expected pictures in"),
+        ("synthetic/train.json", lambda v: v.clear(), "expected labels of pictures, found none"),
         ("camera.json", lambda v: v.pop("Nu"), "expected Nu, Nv, cameraMatrix"),
         ("camera.json", lambda v: v.update(cameraMatrix=[[1, 2], [3, 4]]), "expected Nu, Nv, cameraMatrix"),
         ("camera.json", lambda v: v.update(cameraMatrix=[[0, 0, 0]] * 3), "focal lengths"),

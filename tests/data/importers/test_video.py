@@ -20,7 +20,15 @@ from spacesim.data.importers.video import frames as frames_of
 from spacesim.data.importers.video import importing
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import Survey, choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, strays, without_floating
+from spacesim.data.importers.video.model import (
+    SfmModel,
+    arc_of,
+    hull_length,
+    placed,
+    report_of,
+    strays,
+    without_floating,
+)
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
 from spacesim.data.importers.video.sfm import put_on_path
 from spacesim.data.records import Camera, Dataset, Frame
@@ -244,6 +252,16 @@ def test_a_model_is_put_upright_to_scale_and_about_the_object():
     assert draw_cameras(right).shape[2] == 3
 
 
+def test_the_arc_of_cameras_is_between_those_farthest_apart():
+    model = model_of(np.zeros((1, 3)), Rotation.identity(), 1.0, np.zeros(3))
+    towards = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([3.0, 14.0, 0.0, 9.0, 170.0])])
+    poses = model.world_from_camera.copy()
+    poses[:, :3, 3] = towards * [[2.0], [5.0], [3.0], [1.0], [4.0]]
+    assert arc_of(replace(model, world_from_camera=poses)) == pytest.approx(170.0)
+    assert arc_of(replace(model, world_from_camera=poses[:4])) == pytest.approx(14.0)
+    assert arc_of(replace(model, world_from_camera=poses[:1])) == 0.0
+
+
 def test_silhouettes_tell_the_length_where_points_cover_a_part(monkeypatch):
     """Of a long box, which the cameras must see from the side."""
     monkeypatch.setattr(made_pictures, "BOX", np.array([1.0, 0.3, 0.3]))
@@ -398,6 +416,18 @@ def test_a_camera_that_only_turns_shows_no_parallax(tmp_path):
     with pytest.raises(InputError, match=r"in: expected .*no parallax"):
         import_dataset("images", tmp_path / "in", tmp_path / "out", fov=FOV)
     assert not (tmp_path / "out").exists()
+
+
+@needs_colmap
+def test_a_small_arc_is_warned_of(tmp_path, caplog):
+    for degrees in (8.0, 60.0):
+        source = tmp_path / f"{degrees:g}"
+        for k, pose in enumerate(poses_around(8, degrees)):
+            write_png(source / f"{k}.png", box_from(pose)[0])
+        import_dataset("images", source, tmp_path / f"out{degrees:g}", masks="none", fov=FOV)
+    said = [record.getMessage() for record in caplog.records if "go around the object" in record.getMessage()]
+    assert len(said) == 1
+    assert said[0].startswith(f"{tmp_path / '8'}: expected cameras that go around the object by 20 degrees or more")
 
 
 @needs_colmap

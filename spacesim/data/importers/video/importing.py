@@ -22,16 +22,16 @@ from spacesim.data.importers.masks import (
     AUTO,
     MASKED,
     NO_MASKS,
-    NO_OBJECT,
     MaskFolder,
     as_color,
+    check_shown,
     mask_options,
     over_black,
     read_mask,
 )
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, hull_length, placed, report_of, without_floating
+from spacesim.data.importers.video.model import SfmModel, arc_of, hull_length, placed, report_of, without_floating
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import (
@@ -47,6 +47,7 @@ from spacesim.data.records import Camera, Dataset
 FRAMES = 120  #: taken of a video, at most
 LEAST = 3  #: pictures that poses can be found of
 REGISTERED = 0.9  #: share of pictures with a pose below which a warning is logged
+ARC = 20.0  #: degrees that cameras go around the object below which a warning is logged
 _RIM = 2  # pixels along the outline in which no features are taken: they are of what is behind, too
 _STAGES = ("cut out", "features", "matches", "poses", "write")
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
@@ -187,6 +188,11 @@ def _import(
             "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)",
             src, len(model.names), len(names),
         )  # fmt: skip
+    if (arc := arc_of(model)) < ARC:
+        _log.warning(
+            "%s: expected cameras that go around the object by %g degrees or more, found %.2g: shape, scale and lens "
+            "are uncertain", src, ARC, arc,
+        )  # fmt: skip
     stream = io.BytesIO()
     Image.fromarray(draw_cameras(model)).save(stream, format="PNG")
     unit = "metres" if settings.length or settings.distance else "median distance of the cameras"
@@ -218,10 +224,7 @@ def _find_masks(folder: Path, names: Sequence[str], settings: ImportOptions, tel
         ]
         masks = segment_sequence(loads, lambda count: tell("cut out", count, len(names), ""))
     empty = [name for name, mask in zip(names, masks, strict=True) if not mask.any()]
-    if len(empty) == len(names):
-        raise InputError(NO_OBJECT)
-    if empty:
-        _log.warning("masks: nothing is found in %d of %d pictures, %s first", len(empty), len(names), empty[0])
+    check_shown(empty, len(names))
     for name, mask in zip(names, masks, strict=True):
         write_png(folder / "masks" / name, np.where(mask, 255, 0).astype(np.uint8), durable=False)
     return True

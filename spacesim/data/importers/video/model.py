@@ -1,5 +1,6 @@
 """What structure from motion finds, put upright, to scale and about the object."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -170,6 +171,12 @@ def placed(
     poses[:, :3, :3] = rotation @ poses[:, :3, :3]
     poses[:, :3, 3] = scale * (model.positions - middle) @ rotation.T
     return replace(model, world_from_camera=poses, points=scale * offsets @ rotation.T)
+
+
+def arc_of(model: SfmModel) -> float:
+    """Degrees between the two cameras that lie farthest apart as the origin sees them, at most 180."""
+    towards = normalize(model.positions)
+    return math.degrees(math.acos(np.clip(min((towards @ one).min() for one in towards), -1, 1)))
 
 
 def report_of(model: SfmModel, names: Sequence[str]) -> dict[str, JsonValue]:
