@@ -18,8 +18,8 @@ in other ways than moved so, and a step of each moves pixels about as far:
 The world's axes, origin and unit of length do not follow from pictures. Where training starts at points or a mesh,
 these do: at first their centres stay, and each camera finds its place before them. From then on, and from the
 first step where training starts at random, the world stays where the cameras have it: what the numbers of all pictures
-share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of angles
-and of shifts per distance) stays as it was, by a correction every `GAUGE_EVERY` steps.
+share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of what
+moves in the pictures) stays as it was, by a correction every `GAUGE_EVERY` steps.
 """
 
 from dataclasses import dataclass, replace
@@ -43,6 +43,7 @@ START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours
 ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
+RADIUS = 0.25  #: of an object, in widths of the picture: a turn and a shift along the axis move pixels by so much less
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
 
@@ -205,25 +206,24 @@ class _Gauge:
 
     @staticmethod
     def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array) -> "_Gauge":
-        # y = (turn w, shift of the camera per distance) = A (w, u);  the camera shifts by w x m / d - u
-        forward, back = np.zeros((2, len(cameras), 6, 6))
-        common = np.zeros((len(cameras), 6, 7))
+        common, weights = np.zeros((len(cameras), 6, 7)), np.ones((len(cameras), 6, 1))
         for i, (camera, middle, distance) in enumerate(zip(cameras, seen, distances, strict=True)):
             x, y, z = middle / distance
             levers = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # w x m / d = levers w
-            forward[i] = np.block([[np.eye(3), np.zeros((3, 3))], [levers, -np.eye(3)]])
-            back[i] = forward[i]  # its own inverse
+            # (turn w, shift of the camera per distance) = back (w, u), its own inverse: the shift is w x m / d - u
+            back = np.block([[np.eye(3), np.zeros((3, 3))], [levers, -np.eye(3)]])
             axes, arm = camera.camera_from_world[:3, :3], camera.position - centre
             turned = np.array([[0, arm[2], -arm[1]], [-arm[2], 0, arm[0]], [arm[1], -arm[0], 0]])  # t x arm
             common[i, :3, :3] = -axes
             common[i, 3:, :3] = axes @ turned / distance
             common[i, 3:, 3:6] = axes / distances.mean()
             common[i, 3:, 6] = axes @ arm / distance
-        left, sizes, _ = np.linalg.svd(common.reshape(-1, 7), full_matrices=False)
-        basis = left[:, sizes > 1e-6 * sizes.max()].reshape(len(cameras), 6, -1)
-        ways = np.einsum("vij,vjk->vik", back, basis).reshape(6 * len(cameras), -1)
-        shares = np.einsum("vjk,vji->kvi", basis, forward).reshape(-1, 6 * len(cameras))
-        growth = basis.reshape(6 * len(cameras), -1).T @ common[:, :, 6].ravel()
+            common[i] = back @ common[i]
+            weights[i, [0, 1, 2, 5]] = RADIUS * max(camera.width / camera.fx, camera.height / camera.fy)
+        left, sizes, _ = np.linalg.svd((weights * common).reshape(-1, 7), full_matrices=False)
+        basis = left[:, sizes > 1e-6 * sizes.max()]
+        ways, shares = basis / weights.reshape(-1, 1), (basis * weights.reshape(-1, 1)).T
+        growth = basis.T @ (weights * common)[:, :, 6].ravel()
         return _Gauge(ways, shares, growth / max(float(np.linalg.norm(growth)), 1e-12))
 
     def rigid(self, numbers: Array) -> Array:
