@@ -43,7 +43,7 @@ START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours
 ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
-RADIUS = 0.25  #: of an object, in widths of the picture: a turn and a shift along the axis move pixels by so much less
+RADIUS = 0.25  #: of an object, in widths of the picture: a turn about its centre moves pixels by so much less
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
 
@@ -219,7 +219,7 @@ class _Gauge:
             common[i, 3:, 3:6] = axes / distances.mean()
             common[i, 3:, 6] = axes @ arm / distance
             common[i] = back @ common[i]
-            weights[i, [0, 1, 2, 5]] = RADIUS * max(camera.width / camera.fx, camera.height / camera.fy)
+            weights[i, :3] = RADIUS * max(camera.width / camera.fx, camera.height / camera.fy)
         left, sizes, _ = np.linalg.svd((weights * common).reshape(-1, 7), full_matrices=False)
         basis = left[:, sizes > 1e-6 * sizes.max()]
         ways, shares = basis / weights.reshape(-1, 1), (basis * weights.reshape(-1, 1)).T
