@@ -48,7 +48,7 @@ class PosedPicture:
 
     path: Path  #: of the picture, which has the lens's size
     world_from_camera: Array  #: [4, 4], OpenCV axes
-    lens: Lens
+    lens: Lens  #: pixels
 
 
 @dataclass(frozen=True, eq=False)
