@@ -128,6 +128,7 @@ class LearnedPictures:
         if not self._learned():
             return None
         gains = self.exposures.all_gains() if self.exposures else None
+        suns = self.suns.described() if self.suns else None
         frames: list[dict[str, JsonValue]] = []
         for picture, frame in enumerate(self.frames):
             camera = self.poses.camera(picture) if self.poses else frame.camera
@@ -135,8 +136,8 @@ class LearnedPictures:
             frames[-1] |= intrinsics_of(camera)
             if gains is not None:
                 frames[-1]["gain"] = gains[picture].tolist()
-            if self.suns:
-                frames[-1] |= self.suns.described(picture)
+            if suns is not None:
+                frames[-1] |= suns[picture]
         return {"camera_model": "PINHOLE", "frames": frames}
 
     def summary(self) -> dict[str, dict[str, float]]:

@@ -140,12 +140,15 @@ class SunEstimation:
         self.numbers.values = directions
         self.numbers.first[:] = 0
 
-    def described(self, picture: int) -> dict[str, JsonValue]:
-        """Of cameras.json: as transforms.json names a Sun, and how sure it is."""
-        sun = Sun(self.direction(picture))
-        azimuth, elevation = sun.angles
-        named = {"sun_direction": sun.direction.tolist(), "sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation}
-        return {**named, "sun_sigma_deg": float(self.told()[picture])}
+    def described(self) -> list[dict[str, JsonValue]]:
+        """Of cameras.json, for each picture: as transforms.json names a Sun, and how sure it is."""
+        described: list[dict[str, JsonValue]] = []
+        for direction, sigma in zip(self.directions(), self.told(), strict=True):
+            sun = Sun(direction)
+            azimuth, elevation = sun.angles
+            named = {"sun_direction": sun.direction.tolist(), "sun_azimuth_deg": azimuth}
+            described.append({**named, "sun_elevation_deg": elevation, "sun_sigma_deg": float(sigma)})
+        return described
 
     def told(self) -> Array:
         """[V] degrees: how far Suns may be off, their own sigmas, but no less than what halves of pictures held out are
