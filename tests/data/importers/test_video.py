@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.images import load_image, read_png, write_png
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.video import frames as frames_of
@@ -26,11 +26,9 @@ from spacesim.data.importers.video.model import (
     hull_length,
     placed,
     report_of,
-    strays,
     without_floating,
 )
 from spacesim.data.importers.video.segmentation import segment, segment_sequence
-from spacesim.data.importers.video.sfm import put_on_path
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.eval.align import align
 
@@ -288,68 +286,6 @@ def test_points_that_float_are_left_out():
     kept = without_floating(model).points
     assert len(kept) >= 499 - 1
     assert np.linalg.norm(kept, axis=1).max() < 1.5
-
-
-def film_path(shake: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and positions [60, 3] of a camera that flies around and, after a cut, comes nearer, at a distance of about
-    one, shaken by `shake` of that."""
-    rng = np.random.default_rng(seed)
-    times = np.cumsum(rng.integers(1, 4, 60)).astype(float)
-    angles = np.radians(0.5 * times)
-    around = np.stack([np.cos(angles), np.sin(angles), 0.2 * angles], axis=1)
-    nearer = np.array([[0.0, 0.0, 1.3]]) - np.outer(times - times[40], [0.0, 0.0, 0.01])
-    path = np.where((np.arange(60) < 40)[:, None], around, nearer)
-    return times, path + rng.normal(0, shake / np.sqrt(3), path.shape)
-
-
-@pytest.mark.parametrize("shake", [0.0, 0.001, 0.003])
-def test_a_frame_off_the_path_of_a_film_is_found(shake):
-    times, positions = film_path(shake, 1)
-    assert strays(positions, times, np.ones(60)) == {}
-    true = positions[[20, 23]].copy()
-    positions[[20, 23]] += [[0.03, 0.0, 0.0], [0.0, 0.03, 0.0]]
-    found = strays(positions, times, np.ones(60))
-    assert list(found) == [20, 23]
-    assert np.linalg.norm(list(found.values()) - true, axis=1).max() < 0.001 + 3 * shake
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_shaking_hand_is_no_error(seed):
-    times, positions = film_path(0.02, seed)
-    assert strays(positions, times, np.ones(60)) == {}
-    few = np.arange(8)
-    assert strays(positions[few], times[few], np.ones(8)) == {}
-
-
-@needs_colmap
-def test_a_camera_off_the_path_is_begun_anew_and_left_out_where_its_features_agree(caplog):
-    colmap = importlib.import_module("pycolmap")
-    colmap.set_random_seed(1)
-    options = colmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig, options.num_points2D_without_point3D = 1, 20, 0
-    model = colmap.synthesize_dataset(options)
-    names = [model.images[number].name for number in sorted(model.reg_image_ids())]
-    times = {name: float(k) for k, name in enumerate(names)}
-
-    def see(name, angle, distance):
-        pose = look_at(distance * np.array([np.cos(angle), np.sin(angle), 0.3]), (0.0, 0.0, 0.0))
-        inverse = np.linalg.inv(pose)[:3]
-        image = model.find_image_with_name(name)
-        image.frame.rig_from_world = colmap.Rigid3d(colmap.Rotation3d(inverse[:, :3]), inverse[:, 3])
-        return image
-
-    for k, name in enumerate(names):
-        image = see(name, 0.02 * k, 5.15 if k == 12 else 5.0)  # the features of 12 are those of a place off the path
-        for feature in image.points2D:
-            feature.xy = image.project_point(model.points3D[feature.point3D_id].xyz)
-    see(names[7], 0.02 * 7 + 0.03, 5.0)  # 7 is not where its features say
-    put_on_path(colmap, model, times, lambda: None)
-    assert model.num_reg_images() == 19
-    assert [record.getMessage() for record in caplog.records] == [
-        f"left out, off the camera's smooth path: {names[12]}"
-    ]
-    true = 5 * np.array([np.cos(0.14), np.sin(0.14), 0.3])
-    assert np.linalg.norm(model.find_image_with_name(names[7]).projection_center() - true) < 1e-4
 
 
 @needs_colmap

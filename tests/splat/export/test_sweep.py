@@ -259,6 +259,19 @@ def test_a_video_repeats_to_the_bit_and_shows_its_pictures():
 
 
 @with_video
+def test_a_video_of_larger_moving_pictures_repeats_to_the_bit():
+    noise = np.kron(np.random.default_rng(0).integers(0, 255, (54, 80, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+
+    def encoded():
+        film = Video(480, 270, 25)
+        for k in range(30):
+            film.add(np.ascontiguousarray(noise[k : k + 270, 2 * k : 2 * k + 480]))
+        return film.content()
+
+    assert len({encoded() for _ in range(3)}) == 1
+
+
+@with_video
 @pytest.mark.parametrize(
     ("rate", "expected"),
     [

@@ -18,9 +18,6 @@ _LEAST_TRACK = 3  # pictures that see a point
 _VOXELS = 64  # along an edge of the cube that silhouettes are cut from
 _WRONG = 0.02  # share of masks, and one besides, that may be wrong at a voxel
 _LONG = 1.5  # times the spread along the next axis: silhouettes from few sides stretch an object that is not long
-_BESIDE = 4  # pictures of a film before and after one, by which its place is told
-_STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
-_LEAST_STRAY = 0.005  # of the distance
 _LEAST_SIDE = 70.0  # degrees between the longest axis and a view: from ahead silhouettes stretch it
 
 
@@ -55,6 +52,20 @@ def without_floating(model: SfmModel) -> SfmModel:
         points = model.points[kept]
         gaps = cKDTree(points).query(points, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
         kept = kept[gaps <= _FLOATING * np.median(gaps)]
+    return _with_points(model, kept.tolist())
+
+
+def without_pictures(model: SfmModel, numbers: Sequence[int]) -> SfmModel:
+    """The model without some of its pictures and what these alone see."""
+    kept = [k for k in range(len(model.names)) if k not in set(numbers)]
+    rows = {k: row for row, k in enumerate(kept)}
+    seen_by = tuple(tuple(rows[k] for k in frames if k in rows) for frames in model.seen_by)
+    names = tuple(model.names[k] for k in kept)
+    model = replace(model, names=names, world_from_camera=model.world_from_camera[kept], seen_by=seen_by)
+    return _with_points(model, [k for k, frames in enumerate(seen_by) if frames])
+
+
+def _with_points(model: SfmModel, kept: Sequence[int]) -> SfmModel:
     return replace(
         model,
         points=model.points[kept],
@@ -62,34 +73,6 @@ def without_floating(model: SfmModel) -> SfmModel:
         errors=model.errors[kept],
         seen_by=tuple(model.seen_by[k] for k in kept),
     )
-
-
-def strays(positions: Array, times: Array, distances: Array) -> dict[int, Array]:
-    """Where cameras of a film would be by their neighbours that are far from it: [3] by their numbers.
-
-    It is a parabola over time through four cameras before and four after, by least squares, the worst of them left out.
-    A camera strays if it is off by more than half a per cent of its distance, and by six times what the film's cameras
-    are in the median and what these neighbours are, so that shaking and cuts are none. The first and last four are not
-    looked at. Attitudes are not: a hand turns a camera more than it moves it.
-
-    positions: [N, 3]; times: [N], rising, of any unit; distances: [N] of the object from the cameras
-    """
-    judged = range(_BESIDE, len(positions) - _BESIDE)
-    expected = np.empty((len(judged), 3))
-    spread = np.full(len(judged), np.inf)
-    for row, k in enumerate(judged):
-        near = np.r_[k - _BESIDE : k, k + 1 : k + _BESIDE + 1]
-        for left_out in near:
-            others = near[near != left_out]
-            powers = np.vander((times[others] - times[k]) / np.ptp(times[near]), 3)
-            fitted = np.linalg.lstsq(powers, positions[others], rcond=None)[0]
-            rest = np.square(powers @ fitted - positions[others]).sum() / (len(others) - 3)
-            if rest < spread[row] ** 2:
-                spread[row], expected[row] = np.sqrt(rest), fitted[2]
-    away = np.linalg.norm(positions[list(judged)] - expected, axis=1) / distances[list(judged)]
-    least = np.maximum(spread / distances[list(judged)], np.median(away) if len(away) else 0.0)
-    found = np.flatnonzero(away > np.maximum(_LEAST_STRAY, _STRAY * least))
-    return {judged[row]: expected[row] for row in found}
 
 
 def hull_length(model: SfmModel, masks: Sequence[np.ndarray]) -> float | None:

@@ -15,11 +15,11 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.geometry import Array, degrees_between, normalize
-from spacesim.data.importers.video.model import SfmModel, strays
+from spacesim.data.geometry import Array, degrees_between
+from spacesim.data.importers.video.model import SfmModel, without_pictures
+from spacesim.data.importers.video.path import Features, on_path, strays
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
@@ -36,7 +36,6 @@ _STRICT = 480  # pixels of the longer side for which a match may be off by one; 
 _SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
 _BETTER = 0.95  # share of the error that may be left, for distortion to be believed
-_AS_GOOD = 1.1  # times the cost of a pose off the film's path that one on it may have
 _OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
 
 _log = logging.getLogger(__name__)
@@ -68,8 +67,8 @@ def reconstruct(
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
-    times: of the pictures in their film, rising, of any unit: cameras off its smooth path (`model.strays`) are then
-    begun anew from it, and left out with a warning where that fails
+    times: of the pictures in their film, rising, of any unit: cameras are then put on a smooth path (`path.on_path`),
+    and left out with a warning where they stray from it all the same (`path.strays`)
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
@@ -115,11 +114,11 @@ def reconstruct(
     models[0] = _triangulated(
         colmap, database, folder, workspace, _mapping(colmap, focal, strict, distorted), models[0]
     )
-    adjust = partial(_adjust, colmap, models[0], focal is None, distorted)
-    adjust()
+    _adjust(colmap, models[0], focal is None, distorted)
+    model, features = _model(models[0], [m.num_reg_images() for m in models])
     if times is not None:
-        put_on_path(colmap, models[0], dict(zip(names, times, strict=True)), adjust)
-    model = _checked(_model(models[0], [m.num_reg_images() for m in models]), matches, len(names), folder.name)
+        model = put_on_path(model, features, dict(zip(names, times, strict=True)))
+    model = _checked(model, matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
     return model
@@ -201,13 +200,14 @@ def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, strict
         "device": colmap.Device.cpu,
     }
     if count > EXHAUSTIVE[0 if ordered else 1]:
-        pairing = colmap.SequentialPairingOptions()
-        pairing.overlap = OVERLAP
-        match = colmap.match_sequential
+        near, far = colmap.SequentialPairingOptions(), colmap.SequentialPairingOptions()
+        near.overlap = far.overlap = OVERLAP
+        near.quadratic_overlap = False
+        works = [partial(colmap.match_sequential, pairing_options=pairing) for pairing in (near, far)]
     else:
-        pairing = colmap.ExhaustivePairingOptions()
-        match = colmap.match_exhaustive
-    _run(colmap, lambda token: match(database, pairing_options=pairing, cancellation_token=token, **shared))
+        works = [partial(colmap.match_exhaustive, pairing_options=colmap.ExhaustivePairingOptions())]
+    for match in works:
+        _run(colmap, lambda token, match=match: match(database, cancellation_token=token, **shared))  # type: ignore[misc]
     report("matches", 1, 1)
 
 
@@ -293,56 +293,19 @@ def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: P
     )
 
 
-def put_on_path(colmap: ModuleType, model: Any, times: Mapping[str, float], adjust: Callable[[], object]) -> None:
-    """Begin those cameras of a film's model anew from its path that stray (`model.strays`), and take out of it, with a
-    warning, those that stray again.
+def put_on_path(model: SfmModel, features: Features, times: Mapping[str, float]) -> SfmModel:
+    """A film's model with its cameras on a smooth path (`path.on_path`), without those that stray from it all the same
+    (`path.strays`), with a warning.
 
-    times: of the pictures by their names, as `reconstruct` has them; adjust: adjusts the whole model
+    times: of the pictures by their names, as `reconstruct` has them
     """
-    astray = _strays(model, times)
-    if any([_begin_anew(colmap, model, name, position) for name, position in astray.items()]):  # all of them
-        adjust()
-    lost = [name for name in _strays(model, times) if name in astray]
-    for name in lost:
-        model.deregister_frame(model.find_image_with_name(name).frame_id)
+    when = np.array([times[name] for name in model.names], np.float64)
+    model = on_path(model, features, when, _SOFT)
+    distances = np.array([_depths(model, k) for k in range(len(model.names))])
+    lost = strays(model.positions, when, distances)
     if lost:
-        _log.warning("left out, off the camera's smooth path: %s", ", ".join(lost))
-
-
-def _strays(model: Any, times: Mapping[str, float]) -> dict[str, Array]:
-    """Where cameras that stray would be by their neighbours, by their pictures' names."""
-    found = _model(model, [])
-    distances = np.array([_depths(found, k) for k in range(len(found.names))])
-    places = strays(found.positions, np.array([times[name] for name in found.names]), distances)
-    return {found.names[k]: place for k, place in places.items()}
-
-
-def _begin_anew(colmap: ModuleType, model: Any, name: str, position: Array) -> bool:
-    """Adjust one pose from a position, turned as its features are seen from there, and keep it if it fits about as well
-    as the one it has; whether it does."""
-    image = model.find_image_with_name(name)
-    features = image.get_observation_points2D()
-    if len(features) < 3:
-        return False
-    pixels = np.array([feature.xy for feature in features])
-    points = np.array([model.points3D[feature.point3D_id].xyz for feature in features])
-    rays = np.column_stack([image.camera.cam_from_img(pixels), np.ones(len(pixels))])
-    turn = Rotation.align_vectors(normalize(rays), normalize(points - position))[0].as_matrix()
-    options = colmap.AbsolutePoseRefinementOptions()
-    options.loss_function_scale, options.gradient_tolerance = _SOFT, 1e-6
-    start = colmap.Rigid3d(colmap.Rotation3d(turn), -turn @ position)
-    found = colmap.refine_absolute_pose(start, pixels, points, np.ones(len(pixels), bool), image.camera, options)
-    if found is None:
-        return False
-
-    def cost(pose: Any) -> float:
-        off = image.camera.img_from_cam(pose * points) - pixels
-        return float(np.log1p(np.square(off).sum(axis=1) / _SOFT**2).sum())  # Cauchy's, as that of `_adjust`
-
-    if not cost(found["cam_from_world"]) <= _AS_GOOD * cost(image.cam_from_world()):
-        return False
-    image.frame.rig_from_world = found["cam_from_world"]
-    return True
+        _log.warning("left out, off the camera's smooth path: %s", ", ".join(model.names[k] for k in lost))
+    return without_pictures(model, lost)
 
 
 def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
@@ -398,7 +361,8 @@ def _doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: boo
         )  # fmt: skip
 
 
-def _model(model: Any, sizes: list[int]) -> SfmModel:
+def _model(model: Any, sizes: list[int]) -> tuple[SfmModel, Features]:
+    """(the model, what its pictures show of its points)."""
     images = sorted((model.images[number] for number in model.reg_image_ids()), key=lambda image: image.name)
     poses = []
     for image in images:
@@ -410,7 +374,14 @@ def _model(model: Any, sizes: list[int]) -> SfmModel:
     numbers = {image.image_id: k for k, image in enumerate(images)}
     seen = [[numbers[e.image_id] for e in point.track.elements if e.image_id in numbers] for point in points]
     focal, cx, cy, k1 = camera.params.tolist()
-    return SfmModel(
+    shown = [image.get_observation_points2D() for image in images]
+    rows = {number: k for k, number in enumerate(sorted(model.points3D))}
+    features = Features(
+        np.repeat(np.arange(len(images)), [len(found) for found in shown]),
+        np.array([rows[feature.point3D_id] for found in shown for feature in found], int),
+        np.array([feature.xy for found in shown for feature in found]).reshape(-1, 2),
+    )
+    found = SfmModel(
         names=tuple(image.name for image in images),
         world_from_camera=np.array(poses),
         focal=focal,
@@ -424,6 +395,7 @@ def _model(model: Any, sizes: list[int]) -> SfmModel:
         seen_by=tuple(tuple(dict.fromkeys(frames)) for frames in seen),
         sizes=tuple(sizes),
     )
+    return found, features
 
 
 def check_focal(focal: float, size: tuple[int, int], name: str, hint: str = "") -> None:

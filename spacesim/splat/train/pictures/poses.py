@@ -19,7 +19,9 @@ The world's axes, origin and unit of length do not follow from pictures. Where t
 these do: at first their centres stay, and each camera finds its place before them. From then on, and from the
 first step where training starts at random, the world stays where the cameras have it: what the numbers of all pictures
 share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of what
-moves in the pictures) stays as it was, by a correction every `GAUGE_EVERY` steps.
+moves in the pictures) stays as it was, by a correction every `GAUGE_EVERY` steps. Independent errors of cameras share
+little: where all moved far more alike than each by itself, points and pictures disagree, as when points came from these
+very cameras, and the cameras are believed.
 """
 
 from dataclasses import dataclass, replace
@@ -43,6 +45,7 @@ START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours
 ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
+BELIEVED = 3.0  #: times what cameras share that err apart from each other, root mean square
 RADIUS = 0.25  #: of an object, in widths of the picture: a turn about its centre moves pixels by so much less
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
@@ -99,7 +102,7 @@ class PoseRefinement:
             return
         if steps == self.anchored and steps > 0:
             self.numbers.follow()
-            self.common = self._gauge.rigid(self.numbers.values)
+            self.common = self._gauge.believed(self.numbers.values)
         elif steps > self.anchored and (steps % GAUGE_EVERY == 0 or steps == self.iterations):
             self.numbers.follow()
             self.numbers.values = self._gauge.held(self.numbers.values, self.common)
@@ -200,6 +203,7 @@ def left_jacobian(turn: Array) -> Array:
 class _Gauge:
     """What all cameras may share: 7 ways of the numbers of all pictures, and how much of each there is."""
 
+    weights: Array  #: [6 V] widths of a picture that a number moves it by
     ways: Array  #: [6 V, R] numbers that a common motion gives; R of 7, fewer where cameras are few
     shares: Array  #: [R, 6 V] of each, in given numbers
     growth: Array  #: [R] unit, of the ways: what a growth gives
@@ -222,16 +226,20 @@ class _Gauge:
             weights[i, :3] = RADIUS * max(camera.width / camera.fx, camera.height / camera.fy)
         left, sizes, _ = np.linalg.svd((weights * common).reshape(-1, 7), full_matrices=False)
         basis = left[:, sizes > 1e-6 * sizes.max()]
-        ways, shares = basis / weights.reshape(-1, 1), (basis * weights.reshape(-1, 1)).T
+        moves = weights.ravel()
         growth = basis.T @ (weights * common)[:, :, 6].ravel()
-        return _Gauge(ways, shares, growth / max(float(np.linalg.norm(growth)), 1e-12))
+        growth /= max(float(np.linalg.norm(growth)), 1e-12)
+        return _Gauge(moves, basis / moves[:, None], (basis * moves[:, None]).T, growth)
 
-    def rigid(self, numbers: Array) -> Array:
+    def believed(self, numbers: Array) -> Array:
         """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
-        would follow it."""
+        would follow it. Nothing where it is more than `BELIEVED` times what errors of the size that is left would share
+        by chance: the ways are orthonormal, so that each has of independent errors as much as each number."""
         shares = self.shares @ numbers.ravel()
         rigid: Array = shares - self.growth * (self.growth @ shares)
-        return rigid
+        left = np.square(self.weights * numbers.ravel()).sum() - np.square(shares).sum()
+        by_chance = left / max(numbers.size - len(shares), 1)
+        return rigid if np.square(rigid).mean() <= BELIEVED**2 * by_chance else np.zeros_like(rigid)
 
     def held(self, numbers: Array, common: Array | float = 0.0) -> Array:
         """The numbers [V, 6] with `common` [R] in place of what all share."""

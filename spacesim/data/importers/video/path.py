@@ -1,0 +1,198 @@
+"""The cameras of a film put on a smooth path: bundle adjustment with how a camera moves beside what it sees.
+
+Features alone leave a film's cameras loose where all of an object is seen from ahead: its two halves then stand askew
+by half a degree, at no cost in pixels. A camera does not jump: of four pictures in a row the last is nearly where a
+parabola through the others would have it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from spacesim.data.geometry import Array
+from spacesim.data.importers.video.model import SfmModel
+
+_ROW = 4  # pictures whose places are compared: the third difference is nought on a parabola
+_LEAST_PICTURES = 12
+_LEAST_DEPARTURE = 1e-5  # of the distance
+_BESIDE = 4  # pictures of a film before and after one, by which its place is told
+_STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
+_LEAST_STRAY = 0.005  # of the distance
+_STEPS, _ENOUGH = 30, 1e-5  # at most; share of the cost by which a step must lower it
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Where pictures show points."""
+
+    pictures: np.ndarray  #: [F] numbers
+    points: np.ndarray  #: [F] numbers
+    pixels: Array  #: [F, 2]
+
+
+def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
+    """The model with poses and points adjusted to features and to a smooth path of the cameras' positions.
+
+    The cost of a feature that is d pixels off is log(1 + (d / soft)^2), Cauchy's, so that highlights, which move, pull
+    little, over the mean number of a point's features: what moves one moves the others alike. The cost of a departure
+    from the path is Cauchy's, too, in units of the median departure before, so that a shaking hand is left to
+    shake, and a cut is none. Levenberg's and Marquardt's steps, float64; the first camera and one coordinate of the
+    farthest stay. A film of fewer than twelve pictures is returned as it is.
+
+    features: of this model's pictures and points; times: [N] of its pictures, rising, of any unit; soft: pixels
+    """
+    count = len(model.names)
+    if count < _LEAST_PICTURES:
+        return model
+    problem = _Problem(model, features, np.asarray(times, np.float64), soft)
+    state = model.world_from_camera[:, :3, :3], model.positions, model.points
+    far = int(np.argmax(np.linalg.norm(model.positions - model.positions[0], axis=1)))
+    held = [*range(6), 6 * far + 3 + int(np.argmax(np.abs(model.positions[far] - model.positions[0])))]
+    free = np.setdiff1d(np.arange(6 * count + 3 * len(model.points)), held)
+    cost, damping = problem.cost(*state), 1e-4
+    for _ in range(_STEPS):
+        slopes, residuals = problem.linearized(*state)
+        slopes = slopes[:, free]
+        normal, right = slopes.T @ slopes, -(slopes.T @ residuals)
+        while damping < 1e6:
+            step = np.zeros(6 * count + 3 * len(model.points))
+            damped = normal + damping * sparse.diags_array(normal.diagonal() + 1e-12)
+            step[free] = _solved(damped.tocsr(), right, len(model.points))
+            moved = _moved(state, step)
+            gain = cost - problem.cost(*moved)
+            if gain > 0:
+                break
+            damping *= 10
+        else:
+            break
+        state, cost, damping = moved, cost - gain, max(damping / 10, 1e-8)
+        if gain < _ENOUGH * cost:
+            break
+    poses = model.world_from_camera.copy()
+    poses[:, :3, :3], poses[:, :3, 3] = state[0], state[1]
+    away = np.linalg.norm(problem.off(*state)[0], axis=1)
+    sums, counts = (np.bincount(features.points, weights, len(model.points)) for weights in (away, None))
+    return replace(model, world_from_camera=poses, points=state[2], errors=sums / np.maximum(counts, 1))
+
+
+def strays(positions: Array, times: Array, distances: Array) -> list[int]:
+    """Numbers of the cameras of a film that are far from where they would be by their neighbours.
+
+    That is by a parabola over time through four cameras before and four after, by least squares, the worst left out. A
+    camera strays if it is off by more than half a per cent of its distance, and by six times what the film's cameras
+    are in the median and what these neighbours are, so that shaking and cuts are none. The first and last four are not
+    looked at. Attitudes are not: a hand turns a camera more than it moves it.
+
+    positions: [N, 3]; times: [N], rising, of any unit; distances: [N] of the object from the cameras
+    """
+    judged = range(_BESIDE, len(positions) - _BESIDE)
+    expected = np.empty((len(judged), 3))
+    spread = np.full(len(judged), np.inf)
+    for row, k in enumerate(judged):
+        near = np.r_[k - _BESIDE : k, k + 1 : k + _BESIDE + 1]
+        for left_out in near:
+            others = near[near != left_out]
+            powers = np.vander((times[others] - times[k]) / np.ptp(times[near]), 3)
+            fitted = np.linalg.lstsq(powers, positions[others], rcond=None)[0]
+            rest = np.square(powers @ fitted - positions[others]).sum() / (len(others) - 3)
+            if rest < spread[row] ** 2:
+                spread[row], expected[row] = np.sqrt(rest), fitted[2]
+    away = np.linalg.norm(positions[list(judged)] - expected, axis=1) / distances[list(judged)]
+    least = np.maximum(spread / distances[list(judged)], np.median(away) if len(away) else 0.0)
+    found = np.flatnonzero(away > np.maximum(_LEAST_STRAY, _STRAY * least))
+    return [judged[row] for row in found]
+
+
+_State = tuple[Array, Array, Array]  # rotations [N, 3, 3] world from camera, positions [N, 3], points [P, 3]
+
+
+def _moved(state: _State, step: Array) -> _State:
+    rotations, positions, points = state
+    cameras = step[: 6 * len(positions)].reshape(-1, 6)
+    turned = rotations @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
+    return turned, positions + cameras[:, 3:], points + step[6 * len(positions) :].reshape(-1, 3)
+
+
+def _solved(normal: sparse.csr_array, right: Array, points: int) -> Array:
+    """The solution, by the Schur complement: no two points share a feature, theirs are blocks of three at the end."""
+    cameras = normal.shape[0] - 3 * points
+    mixed = normal[:cameras, cameras:]
+    blocks = np.linalg.inv(normal[cameras:, cameras:].tobsr((3, 3)).data)
+    inverse = sparse.bsr_array((blocks, np.arange(points), np.arange(points + 1)))
+    share = mixed @ inverse
+    first = np.linalg.solve(
+        (normal[:cameras, :cameras] - share @ mixed.T).toarray(), right[:cameras] - share @ right[cameras:]
+    )
+    return np.r_[first, inverse @ (right[cameras:] - mixed.T @ first)]
+
+
+class _Problem:
+    """Residuals of features and of the path, and their slopes."""
+
+    def __init__(self, model: SfmModel, features: Features, times: Array, soft: float) -> None:
+        self.features, self.soft = features, soft
+        self.focal, self.k1, self.centre = model.focal, model.k1, np.array(model.centre)
+        self.alike = len(features.points) / max(len(np.unique(features.points)), 1)
+        self.rows = np.arange(len(times) - _ROW + 1)[:, None] + np.arange(_ROW)
+        gaps = times[self.rows][:, :, None] - times[self.rows][:, None] + np.eye(_ROW)
+        weights = 1 / gaps.prod(axis=2)
+        self.weights = weights / np.linalg.norm(weights, axis=1, keepdims=True)
+        around = np.linalg.norm(model.positions - np.median(model.points, axis=0), axis=1)
+        self.sizes = around[self.rows].mean(axis=1)
+        departures = np.linalg.norm(self.departures(model.positions), axis=1)
+        self.sizes *= max(float(np.median(departures)), _LEAST_DEPARTURE)
+
+    def departures(self, positions: Array) -> Array:
+        """[R, 3] from a parabola, of distances; after the first call of the median one."""
+        return np.asarray(np.einsum("rk,rki->ri", self.weights, positions[self.rows]) / self.sizes[:, None])
+
+    def off(self, rotations: Array, positions: Array, points: Array) -> tuple[Array, Array]:
+        """(pixels off [F, 2], features' points in camera axes [F, 3])."""
+        pictures = self.features.pictures
+        local = np.einsum("nji,nj->ni", rotations[pictures], points[self.features.points] - positions[pictures])
+        flat = local[:, :2] / local[:, 2:]
+        lens = 1 + self.k1 * np.square(flat).sum(axis=1, keepdims=True)
+        return self.focal * lens * flat + self.centre - self.features.pixels, local
+
+    def cost(self, rotations: Array, positions: Array, points: Array) -> float:
+        away = np.square(self.off(rotations, positions, points)[0]).sum(axis=1) / self.soft**2
+        astray = np.square(self.departures(positions)).sum(axis=1)
+        return float(np.log1p(away).sum() / self.alike + np.log1p(astray).sum())
+
+    def linearized(self, rotations: Array, positions: Array, points: Array) -> tuple[sparse.csr_array, Array]:
+        """(slopes, residuals) of least squares whose step lowers the cost (iteratively reweighted)."""
+        pictures, count = self.features.pictures, len(positions)
+        off, local = self.off(rotations, positions, points)
+        flat = local[:, :2] / local[:, 2:]
+        square = np.square(flat).sum(axis=1)[:, None, None]
+        lens = (1 + self.k1 * square) * np.eye(2) + 2 * self.k1 * flat[:, :, None] * flat[:, None]
+        by_local = np.concatenate([lens, -lens @ flat[:, :, None]], axis=2) * (self.focal / local[:, 2, None, None])
+        by_point = by_local @ rotations[pictures].transpose(0, 2, 1)
+        by_turn = np.cross(by_local, local[:, None])
+        weights = 1 / (self.soft * np.sqrt((1 + np.square(off).sum(axis=1) / self.soft**2) * self.alike))
+        blocks = np.concatenate([by_turn, -by_point, by_point], axis=2) * weights[:, None, None]
+        columns = np.column_stack(
+            [6 * pictures[:, None] + np.arange(6), 6 * count + 3 * self.features.points[:, None] + np.arange(3)]
+        )
+        seen = sparse.coo_array(
+            (blocks.ravel(), (np.repeat(np.arange(2 * len(off)), 9), np.repeat(columns, 2, axis=0).ravel())),
+            shape=(2 * len(off), 6 * count + 3 * len(points)),
+        )
+        astray = self.departures(positions)
+        pulls = 1 / np.sqrt(1 + np.square(astray).sum(axis=1))
+        values = (pulls / self.sizes)[:, None] * self.weights
+        axes = np.arange(3)
+        path = sparse.coo_array(
+            (
+                np.repeat(values[:, None], 3, axis=1).ravel(),
+                (
+                    np.repeat(np.arange(3 * len(values)), _ROW),
+                    (6 * self.rows[:, None] + 3 + axes[:, None]).ravel(),
+                ),
+            ),
+            shape=(3 * len(values), seen.shape[1]),
+        )
+        residuals = np.r_[(off * weights[:, None]).ravel(), (astray * pulls[:, None]).ravel()]
+        return sparse.vstack([seen, path]).tocsr(), residuals
