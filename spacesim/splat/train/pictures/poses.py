@@ -10,8 +10,8 @@ the Gaussians of what the splats' adjoint gives their centres and rotations (`po
 normals count as given within a step, as they hardly change with so small a motion.
 
 A picture has six numbers (w, u): the camera sees the object turned by w (rotation vector, radians, camera axes) about
-its centre, where the cameras look, and moved by u (camera axes) in units of the distance. Turned so, a picture changes
-in other ways than moved so, and a step of each moves pixels about as far:
+its centre, the starting points' or else where cameras look, and moved by u (camera axes) in units of the distance.
+Turned so, a picture changes in other ways than moved so, and a step of each moves pixels about as far:
 
     p' = exp([w]) (p - m) + m + d u        p: in the given camera's axes;  m: the centre there;  d = |m|
 
@@ -19,9 +19,9 @@ The world's axes, origin and unit of length do not follow from pictures. Where t
 these do: at first their centres stay, and each camera finds its place before them. From then on, and from the
 first step where training starts at random, the world stays where the cameras have it: what the numbers of all pictures
 share with a turn, a shift and a growth of all cameras (7 ways, linearised at the given ones, least squares of what
-moves in the pictures) stays as it was, by a correction every `GAUGE_EVERY` steps. Independent errors of cameras share
-little: where all moved far more alike than each by itself, points and pictures disagree, as when points came from these
-very cameras, and the cameras are believed.
+moves in the pictures: of the starting points, or else of a ball) stays as it was, by a correction every `GAUGE_EVERY`
+steps. Independent errors of cameras share little: where all moved far more alike than each by itself, points and
+pictures disagree, as when points came from these very cameras, and the cameras are believed.
 """
 
 from dataclasses import dataclass, replace
@@ -31,8 +31,9 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Dataset
+from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
@@ -46,7 +47,8 @@ ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a mo
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
 BELIEVED = 3.0  #: times what cameras share that err apart from each other, root mean square
-RADIUS = 0.25  #: of an object, in widths of the picture: a turn about its centre moves pixels by so much less
+RADIUS = 0.25  #: of an object without points, in widths of the picture
+POINTS = 200  #: of those that training starts at, by whose motion the gauge is held
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
 
@@ -64,11 +66,11 @@ class PoseRefinement:
         self.end = iterations
         shown = -(-ANCHORED * len(self.given) // views)
         self.anchored = int(min(self.start + shown, ANCHORED_SHARE * iterations)) if anchor else 0
-        self.centre = focus_point(dataset)
+        self.centre, points = _object_of(dataset)
         self.seen = np.array([c.camera_from_world[:3, :3] @ (self.centre - c.position) for c in self.given])
         self.distances = np.maximum(np.linalg.norm(self.seen, axis=1), 1e-6)
         self.numbers = PictureNumbers(len(self.given), 6, self._taught)
-        self._gauge = _Gauge.of(self.given, self.centre, self.seen, self.distances)
+        self._gauge = _Gauge.of(self.given, self.centre, self.seen, self.distances, points)
         self.common = np.zeros(self._gauge.shares.shape[0])  #: of the gauge's ways, what is held
         self._centre = ad.Float(self.centre.tolist())
         self._gradient = recorded(pose_gradient)
@@ -190,8 +192,7 @@ def pose_gradient(
 
 def left_jacobian(turn: Array) -> Array:
     """[3, 3] J of SO(3): exp([w + dw]) = exp([J dw]) exp([w]) to first order."""
-    angle = float(np.linalg.norm(turn))
-    cross = np.array([[0, -turn[2], turn[1]], [turn[2], 0, -turn[0]], [-turn[1], turn[0], 0]])
+    angle, cross = float(np.linalg.norm(turn)), _crossed(turn)
     if angle < 1e-6:
         return np.eye(3) + 0.5 * cross
     half = (1 - np.cos(angle)) / angle**2
@@ -199,45 +200,68 @@ def left_jacobian(turn: Array) -> Array:
     return jacobian
 
 
+def _crossed(vector: Array) -> Array:
+    """[3, 3] of the cross product with `vector` from the left."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _object_of(dataset: Dataset) -> tuple[Array, Array]:
+    """(its centre [3], some of its points [P, 3], none where training starts without any)."""
+    path = dataset.ply_file_path or dataset.mesh_path
+    if path is None:
+        return focus_point(dataset), np.zeros((0, 3))
+    points = read_points(dataset.root / path)[0].astype(np.float64)
+    return np.median(points, axis=0), points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
+
+
 @dataclass(frozen=True, eq=False)
 class _Gauge:
     """What all cameras may share: 7 ways of the numbers of all pictures, and how much of each there is."""
 
-    weights: Array  #: [6 V] widths of a picture that a number moves it by
+    moves: Array  #: [V, 6, 6] by a picture's numbers: their squares' sum is how far points move, widths squared, mean
     ways: Array  #: [6 V, R] numbers that a common motion gives; R of 7, fewer where cameras are few
     shares: Array  #: [R, 6 V] of each, in given numbers
     growth: Array  #: [R] unit, of the ways: what a growth gives
 
     @staticmethod
-    def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array) -> "_Gauge":
-        common, weights = np.zeros((len(cameras), 6, 7)), np.ones((len(cameras), 6, 1))
+    def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array, points: Array) -> "_Gauge":
+        common, moves = np.zeros((len(cameras), 6, 7)), np.zeros((len(cameras), 6, 6))
         for i, (camera, middle, distance) in enumerate(zip(cameras, seen, distances, strict=True)):
-            x, y, z = middle / distance
-            levers = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # w x m / d = levers w
+            back = np.block([[np.eye(3), np.zeros((3, 3))], [-_crossed(middle / distance), -np.eye(3)]])
             # (turn w, shift of the camera per distance) = back (w, u), its own inverse: the shift is w x m / d - u
-            back = np.block([[np.eye(3), np.zeros((3, 3))], [levers, -np.eye(3)]])
             axes, arm = camera.camera_from_world[:3, :3], camera.position - centre
-            turned = np.array([[0, arm[2], -arm[1]], [-arm[2], 0, arm[0]], [arm[1], -arm[0], 0]])  # t x arm
             common[i, :3, :3] = -axes
-            common[i, 3:, :3] = axes @ turned / distance
+            common[i, 3:, :3] = -axes @ _crossed(arm) / distance
             common[i, 3:, 3:6] = axes / distances.mean()
             common[i, 3:, 6] = axes @ arm / distance
             common[i] = back @ common[i]
-            weights[i, :3] = RADIUS * max(camera.width / camera.fx, camera.height / camera.fy)
-        left, sizes, _ = np.linalg.svd((weights * common).reshape(-1, 7), full_matrices=False)
+            local = (points - camera.position) @ axes.T
+            local = local[local[:, 2] > 0.1 * distance]
+            if len(local) < 8:
+                local = middle + RADIUS * distance * fibonacci_sphere(32)
+            turned = np.array([_crossed(middle - point) for point in local])
+            slopes = np.concatenate([turned, np.broadcast_to(distance * np.eye(3), turned.shape)], axis=2)
+            flat = slopes[:, :2] - (local[:, :2] / local[:, 2:])[:, :, None] * slopes[:, 2:]
+            flat *= np.array([[camera.fx], [camera.fy]]) / (camera.width * local[:, 2, None, None])
+            square = np.einsum("pai,paj->ij", flat, flat) / len(local)
+            moves[i] = np.linalg.cholesky(square + 1e-9 * np.trace(square) * np.eye(6)).T
+        weighted = (moves @ common).reshape(-1, 7)
+        left, sizes, _ = np.linalg.svd(weighted, full_matrices=False)
         basis = left[:, sizes > 1e-6 * sizes.max()]
-        moves = weights.ravel()
-        growth = basis.T @ (weights * common)[:, :, 6].ravel()
+        apart = basis.reshape(*moves.shape[:2], -1)
+        growth = basis.T @ weighted[:, 6]
         growth /= max(float(np.linalg.norm(growth)), 1e-12)
-        return _Gauge(moves, basis / moves[:, None], (basis * moves[:, None]).T, growth)
+        shares = (moves.transpose(0, 2, 1) @ apart).reshape(basis.shape).T
+        return _Gauge(moves, np.linalg.solve(moves, apart).reshape(basis.shape), shares, growth)
 
     def believed(self, numbers: Array) -> Array:
         """[R] of each way in numbers [V, 6], without growth: splats' sizes, which change while their centres stay,
         would follow it. Nothing where it is more than `BELIEVED` times what errors of the size that is left would share
-        by chance: the ways are orthonormal, so that each has of independent errors as much as each number."""
+        by chance: the ways are orthonormal in what moves in pictures, each has as much of it as each number."""
         shares = self.shares @ numbers.ravel()
         rigid: Array = shares - self.growth * (self.growth @ shares)
-        left = np.square(self.weights * numbers.ravel()).sum() - np.square(shares).sum()
+        left = np.square(self.moves @ numbers[:, :, None]).sum() - np.square(shares).sum()
         by_chance = left / max(numbers.size - len(shares), 1)
         return rigid if np.square(rigid).mean() <= BELIEVED**2 * by_chance else np.zeros_like(rigid)
 

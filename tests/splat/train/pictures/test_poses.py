@@ -138,6 +138,18 @@ def test_what_all_cameras_share_is_taken_out(small_dataset):
     assert 0.1 * np.abs(others).mean() < np.abs(held - others).mean() < np.abs(held).mean()
 
 
+def test_what_cameras_share_far_beyond_chance_is_not_believed(small_dataset):
+    """As where points are off the pictures that these cameras fit."""
+    poses = PoseRefinement(small_dataset, 1e-3, 100, False)
+    gauge, numbers = poses._gauge, np.random.default_rng(0).normal(0, 1e-3, poses.numbers.values.shape)
+    numbers = np.linalg.solve(gauge.moves, numbers[:, :, None])[:, :, 0]  # all move pictures alike
+    by_chance = gauge.believed(numbers)
+    assert np.abs(by_chance).max() > 1e-4
+    alike = (gauge.ways @ (np.array([0, 0, 1, 0, 0, 0, 0]) - gauge.growth * gauge.growth[2])).reshape(numbers.shape)
+    np.testing.assert_array_equal(gauge.believed(numbers + 0.1 * alike), 0)
+    np.testing.assert_allclose(gauge.believed(numbers + 1e-4 * alike), by_chance, atol=2e-4)
+
+
 def test_one_camera_stays(small_dataset):
     """Wherever it goes, the model could go."""
     poses = PoseRefinement(replace(small_dataset, train=small_dataset.train[:1]), 1e-3, 50, False)
@@ -177,7 +189,7 @@ def test_disturbed_poses_come_back_before_a_model_that_is_right(small_dataset, k
 
 
 def test_the_model_stays_while_cameras_find_their_places(small_dataset):
-    trainer = Trainer(small_dataset, replace(CONFIG, iterations=100))
+    trainer = Trainer(disturbed(small_dataset, 1), replace(CONFIG, iterations=100))
     before = trainer.gaussians.to_numpy()["means"]
     assert trainer.pictures.poses.anchored == 25
     while trainer.iteration < 25:
