@@ -22,6 +22,7 @@ from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
 from spacesim.data.geometry import Array, quaternion_from_rotation
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import read_points
+from spacesim.data.transforms import read_views
 from spacesim.splat.compose.aligned import moved_frame
 from spacesim.splat.compose.pose import Pose
 
@@ -97,6 +98,16 @@ def align(own: Dataset, truth: Dataset) -> Alignment:
         rms = float(np.sqrt(np.square(away[is_inlier]).mean()))
     turn = float(np.sqrt(np.square(turns[is_inlier]).mean()))
     return Alignment(pose, words, len(matches), int(is_inlier.sum()), rms, max(distance, 1e-12), turn)
+
+
+def as_trained(own: Dataset, run: Path) -> Dataset:
+    """`own` with its training cameras where a run that refined poses has them, in RUN/cameras.json."""
+    path = run / "cameras.json"
+    if not path.is_file():
+        return own
+    views = read_views(path)
+    known = (views.get(frame.file_path, frame).camera for frame in own.train)
+    return replace(own, train=tuple(replace(f, camera=c) for f, c in zip(own.train, known, strict=True)))
 
 
 def moved_dataset(dataset: Dataset, pose: Pose) -> Dataset:

@@ -23,7 +23,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.transforms import check_still
-from spacesim.eval.align import align
+from spacesim.eval.align import align, as_trained
 from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
     depth_range,
@@ -103,7 +103,7 @@ def evaluate(
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
     if not frames:
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none")
-    alignment = align(config.align, dataset) if config.align else None
+    alignment = align(as_trained(config.align, run.path), dataset) if config.align else None
     if alignment:
         if run.parts:
             raise InputError(f"align: expected a run, found {run.path}, a scene, which says itself where models stand")

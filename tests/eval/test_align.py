@@ -17,6 +17,7 @@ from spacesim.eval.align import align, match_frames, moved_dataset, places_in_pi
 from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.write import write_report
 from spacesim.splat.compose import ComposedRun, GaussianComposition, PlacedRun, Pose
+from spacesim.splat.compose.aligned import moved_frame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
@@ -215,6 +216,23 @@ def test_an_aligned_run_is_evaluated_in_the_truths_world(drawn, tmp_path, monkey
     plain = evaluate(run, truth, tmp_path / "plain")
     assert plain["alignment"] is None
     assert plain["image"]["psnr"]["mean"] < 20
+
+
+def test_a_run_is_aligned_by_the_cameras_that_it_refined(drawn, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "nowhere"))
+    run, truth, own = drawn
+    frames = []
+    for frame in own.train:  # given where nothing of the model is
+        keys = {"w": frame.camera.width, "h": frame.camera.height, "fl_x": frame.camera.fx, "fl_y": frame.camera.fy}
+        keys |= {"cx": frame.camera.cx, "cy": frame.camera.cy, "transform_matrix": frame.camera.opengl.tolist()}
+        frames.append({"file_path": frame.file_path, **keys})
+    run.path.mkdir()
+    (run.path / "cameras.json").write_text(json.dumps({"frames": frames}))
+    elsewhere = Pose(np.eye(3), np.array([0.5, 0.2, 0.1]), 1.0)
+    given = replace(own, train=tuple(moved_frame(frame, elsewhere) for frame in own.train))
+    metrics = evaluate(run, truth, tmp_path / "eval", EvaluateConfig(align=given))
+    assert metrics["image"]["psnr"]["mean"] > 40
+    assert metrics["alignment"]["rms"] < 1e-3
 
 
 def test_data_that_are_not_the_runs_are_noted(drawn, tmp_path, monkeypatch):
