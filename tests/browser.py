@@ -150,16 +150,15 @@ class Page:
 
 
 def fill(page: Page, uuid: str, value: str) -> None:
-    """Type into the field of a control of viser, by its number."""
-    found = page.evaluate(
-        f"""(() => {{
-            let row = document.getElementById({uuid!r}) || document.querySelector("label[for='{uuid}']");
-            const visible = "input:not([type=hidden])";
-            while (!row.matches(visible) && !row.querySelector(visible)) row = row.parentElement;
-            const field = row.matches(visible) ? row : row.querySelector(visible);
-            field.scrollIntoView(); field.focus(); field.select(); return true; }})()"""
-    )
-    assert found
+    """Type into the field of a control of viser, by its number, once it is shown: a folder that opens takes a while."""
+    focus = f"""(() => {{
+        let row = document.getElementById({uuid!r}) || document.querySelector("label[for='{uuid}']");
+        if (!row) return false;
+        const visible = "input:not([type=hidden])";
+        while (!row.matches(visible) && !row.querySelector(visible)) row = row.parentElement;
+        const field = row.matches(visible) ? row : row.querySelector(visible);
+        field.scrollIntoView(); field.focus(); field.select(); return document.activeElement == field; }})()"""
+    wait_for(lambda: page.evaluate(focus), "the field")
     page.send("Input.insertText", text=value)
     for kind in ("keyDown", "keyUp"):
         page.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", windowsVirtualKeyCode=13)

@@ -184,6 +184,14 @@ class Sun:
         """(azimuth in [0, 360), elevation in [-90, 90]), degrees."""
         return angles_from_direction(self.direction)
 
+    @property
+    def is_hidden(self) -> bool:
+        """Whether its centre is behind the Earth that it names: less than half of its disc gives light."""
+        earth = self.earth
+        return earth is not None and float(self.direction @ earth.direction) > np.cos(
+            np.radians(earth.angular_radius_deg)
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:

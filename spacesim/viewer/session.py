@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from spacesim.viewer.drawing.frames import STEPS, ResolutionControl, ViewerFrame, draw_frame
 from spacesim.viewer.drawing.loop import AbandonedError, RenderLoop, RenderRequest
-from spacesim.viewer.drawing.paint import Bytes, compare_pictures, paint
+from spacesim.viewer.drawing.paint import ERROR_SCALE, Bytes, compare_pictures, paint
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.state import DisplaySettings, SceneState, SharedScene, ViewerCamera
 from spacesim.viewer.truth.tracer import TraceResult
@@ -247,6 +247,9 @@ class Session:
         self._reported_at = now
         height, width = frame.picture.shape[:2]
         with self._lock:
-            status = "; ".join(filter(None, (frame.note, self._truth_status)))
-        statistics = Statistics(self._rate, frame.seconds, width, height, frame.share, frame.depths, status)
+            differs = self._truth is not None and self._settings.compare == "difference"
+            scale = f"mean difference of the channels: black 0, white {ERROR_SCALE} of 1 and more" if differs else ""
+            status = "; ".join(filter(None, (frame.note, self._truth_status, scale)))
+        depths = None if differs else frame.depths
+        statistics = Statistics(self._rate, frame.seconds, width, height, frame.share, depths, status)
         self._screen.show_statistics(statistics)

@@ -161,7 +161,6 @@ def test_what_is_saved_is_drawn_by_the_command_line(viewer, tab, at_start, space
     viewer.set_state(at_start.with_pose(1, Pose(translation=np.array([0.1, 0.9, 1.0]), scale=0.7)))
     press(tab.page, "Files")
     uuid = viewer.files.name._impl.uuid
-    wait_for(lambda: tab.page.evaluate(f"!!document.querySelector(\"label[for='{uuid}']\")"), "the folder")
     fill(tab.page, uuid, "saved.toml")
     wait_for(lambda: viewer.files.name.value == "saved.toml", "the name")
     press(tab.page, "Save scene")

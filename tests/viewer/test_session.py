@@ -179,6 +179,8 @@ def test_stored_truth_is_shown_at_once(made):
     session.change_settings(compare="wipe", wipe=1.0)
     wait_for(lambda: screen.pictures[-1][0].min() == 255, "the truth")
     wait_for(lambda: screen.statistics[-1].status == "truth: the dataset's frame 3", "a word about it")
+    session.change_settings(compare="difference")
+    wait_for(lambda: "white 0.25 of 1" in screen.statistics[-1].status, "the scale")
 
 
 def test_a_session_that_is_closed_draws_no_more(made):

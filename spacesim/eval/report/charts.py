@@ -79,6 +79,8 @@ def column_histograms(
     marks = [f'<text x="0" y="12">{escape(title)}</text>']
     counts = [np.histogram(values, edges)[0] for _, values in columns]
     most = max(int(count.max()) for count in counts) or 1
+    scale = f"full colour: {most} frame{'s' if most != 1 else ''}"
+    marks.append(f'<text x="{width}" y="12" text-anchor="end">{scale}</text>')
     for column, (count, (label, values)) in enumerate(zip(counts, columns, strict=True)):
         x = _LEFT + step_x * column
         mean = f": mean {np.mean(values):.2f} of {len(values)}" if values else ""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from spacesim.data.files import JsonMapping
+from spacesim.eval.metrics.shadow import THRESHOLD
 from spacesim.eval.pictures import (
     ERROR_SCALE,
     LIT,
@@ -29,6 +30,12 @@ _PANELS: Panels = {
 }
 _DEPTHS: Panels = {"depth_truth": "Truth", "depth": "Prediction"}
 _ALBEDOS: Panels = {"albedo_truth": "Truth", "albedo": "Prediction"}
+_DARK = {
+    "bright": LIT,
+    "dark": SHADOWED,
+    "wrongly dark": WRONGLY_SHADOWED,
+    "wrongly bright": WRONGLY_LIT,
+}
 MISTAKES = {
     "lit": LIT,
     "shadowed": SHADOWED,
@@ -49,7 +56,7 @@ def gallery(runs: Sequence[Evaluation]) -> str:
     if all(run.metrics["dataset"].get("truth") is False for run in runs):
         panels["truth"] = "Picture"
     if all(run.metrics["shadow"] is not None for run in runs):
-        keys += f'<p class="key">{swatches(MISTAKES)}</p>'
+        keys += f'<p class="key"><span>Luminance, dark below {THRESHOLD}:</span>{swatches(_DARK)}</p>'
         panels |= {"shadow_truth": f"Dark pixels, {panels['truth'].lower()}"}
     else:
         panels = {name: label for name, label in panels.items() if not name.startswith("shadow")}
@@ -200,7 +207,7 @@ def _strip(run: Evaluation, name: str, panels: Panels, captions: Panels, limit: 
         )
         for panel, label in panels.items()
     ]
-    three = " three" if len(panels) == 3 else ""
+    three = " three" if len(panels) <= 3 else ""
     return f'<div class="{small}strip{three}">{"".join(figures)}</div>'
 
 

@@ -1,5 +1,6 @@
 """The report: one self-contained HTML page about one or several evaluated runs, side by side."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from spacesim.eval.report.tables import Cell, best_in_bold, by_object, results, 
 MANY_SUNS = 12
 """With more Suns than this, histograms become columns of one chart."""
 
-MAP_WIDTH = 960  #: pixels of the map of training cameras
+MAP_WIDTH = 1340  #: pixels of the map of training cameras
 
 _GAUSSIANS = Metric("gaussians", "Gaussians", "", LOWER, 0, "")
 _RENDER = Metric("render_ms", "Render time", "ms", LOWER, 1, "")
@@ -316,7 +317,7 @@ def _facts_table(caption: str, runs: Sequence[Evaluation], facts: Sequence[Mappi
     for key in keys:
         values = [column.get(key, "–") for column in facts]
         mark = '<span class="differs">{}</span>' if len(set(values)) > 1 else "{}"
-        rows.append([escape(key), *(mark.format(escape(value)) for value in values)])
+        rows.append([re.sub("([._])", r"\1<wbr>", escape(key)), *(mark.format(escape(value)) for value in values)])
     head = ["", *(run.label for run in runs)] if len(runs) > 1 else ["", ""]
     return table(caption, head, [("", rows)])
 
@@ -327,6 +328,8 @@ def _flat(values: JsonMapping, prefix: str = "") -> dict[str, str]:
     for key, value in values.items():
         if isinstance(value, Mapping):
             flat |= _flat(value, f"{prefix}{key}.")
+        elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+            flat |= _flat({str(number): item for number, item in enumerate(value)}, f"{prefix}{key}.")
         elif value not in (None, "", [], ()):
             flat[f"{prefix}{key}"] = str(value)
     return flat

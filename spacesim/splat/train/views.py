@@ -46,7 +46,7 @@ class TrainingViews:
     """Views of a dataset's training frames by index, decoded at first use and kept while memory suffices, see
     `kept_bytes`.
 
-    suns: every frame must name its Sun
+    suns: every frame must name its Sun; those whose Sun its Earth hides are not trained on, where others are left
     truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
     Raises InputError where a frame has not what it must have.
@@ -67,6 +67,11 @@ class TrainingViews:
         self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name in ("normal", "radiance") else 1 for name in truth))
+        sunlit = [i for i, f in enumerate(dataset.train) if not (suns and f.sun is not None and f.sun.is_hidden)]
+        if 0 < len(sunlit) < len(dataset.train):
+            dark = len(dataset.train) - len(sunlit)
+            log.warning("%d of %d training frames are left out: the Earth hides their Sun", dark, len(dataset.train))
+        self._used = sunlit or list(range(len(dataset.train)))
         self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
         in_memory, on_device = kept_bytes()
@@ -80,8 +85,9 @@ class TrainingViews:
         return self._cached(index)
 
     def at_step(self, step: int) -> TrainingView:
-        """The view of a step: every epoch visits all views once, in an order that (seed, epoch) decides."""
-        epoch, place = divmod(step, len(self))
+        """The view of a step: every epoch visits all views that are used once, in an order that (seed, epoch)
+        decides."""
+        epoch, place = divmod(step, len(self._used))
         return self[int(self._order(epoch)[place])]
 
     def pixels(self, view: TrainingView) -> tuple[UInt32, Bool, TruthPlanes]:
@@ -96,7 +102,7 @@ class TrainingViews:
         return upload(view.rgba, ad.UInt32), valid, truth
 
     def _shuffle(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng([self.seed, 1, epoch]).permutation(len(self))
+        return np.random.default_rng([self.seed, 1, epoch]).permutation(self._used)
 
     def _load(self, index: int) -> TrainingView:
         frame = self.dataset.train[index]

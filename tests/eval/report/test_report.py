@@ -19,7 +19,7 @@ from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report import charts
 from spacesim.eval.report.write import write_report
 
-VOID = {"meta", "img", "path", "rect", "br"}
+VOID = {"meta", "img", "path", "rect", "br", "wbr"}
 
 
 class Page(HTMLParser):
@@ -433,6 +433,19 @@ def test_photographs_are_spoken_of_as_such(folder):
     assert "against the pictures themselves" in text
     assert "Picture" in page.text
     assert len(page.values("img", "src")) == 12
+
+
+def test_facts_that_nest_get_a_row_each(folder):
+    def posed(metrics):
+        metrics["dataset"]["config"] = {
+            "objects": [{"mesh": "a.stl", "name": "", "two_sided": None}, {"mesh": "b.stl"}]
+        }
+
+    text = "".join(page_of(another(folder, "posed", posed)).text)
+    for word in ("objects.0.mesh", "objects.1.mesh", "b.stl"):
+        assert word in text, word
+    for word in ("two_sided", "None"):
+        assert word not in text, word
 
 
 def test_what_was_fitted_is_said_beside_the_numbers(folder):

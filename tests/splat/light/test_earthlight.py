@@ -26,6 +26,7 @@ from spacesim.splat.pose.picture import SunlitRun
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.train import train
+from spacesim.splat.train.views import TrainingViews
 
 CONFIG = with_settings(replace(preset("demo", "relight"), iterations=400, init_count=1500), {"checkpoint_every": 300})
 
@@ -55,6 +56,22 @@ def test_frames_name_the_earth_that_lights_them(earthlit):
         np.testing.assert_allclose(frame.sun.earth.direction, [0, 0, -1], atol=1e-12)
         assert frame.sun.earth.angular_radius_deg == pytest.approx(np.degrees(np.arcsin(6378.137 / 6978.137)))
         assert frame.sun.earth.albedo == 0.9
+
+
+def test_frames_whose_sun_the_earth_hides_are_not_trained_on(earthlit, caplog):
+    earth = earthlit.train[0].sun.earth
+    limb = np.radians(-90 + earth.angular_radius_deg)
+    for angle, hidden in ((limb - 0.01, True), (limb + 0.01, False)):
+        assert Sun(np.array([np.cos(angle), 0, np.sin(angle)]), earth).is_hidden == hidden
+    night = replace(earthlit.train[3], sun=Sun(earth.direction, earth))
+    dataset = replace(earthlit, train=(*earthlit.train[:3], night, *earthlit.train[4:]))
+    count = len(dataset.train)
+    views = TrainingViews(dataset, seed=0, suns=True)
+    seen = [views.at_step(step).index for step in range(2 * (count - 1))]
+    every = [k for k in range(count) if k != 3]
+    assert sorted(seen[: count - 1]) == sorted(seen[count - 1 :]) == every
+    assert f"1 of {count} training frames are left out" in caplog.text
+    assert sorted(TrainingViews(dataset, seed=0).at_step(step).index for step in range(count)) == list(range(count))
 
 
 def test_training_takes_the_earth_where_frames_name_one(earthlit, run, tmp_path):
