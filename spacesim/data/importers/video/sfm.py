@@ -36,6 +36,7 @@ _STRICT = 480  # pixels of the longer side for which a match may be off by one; 
 _SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
 _BETTER = 0.95  # share of the error that may be left, for distortion to be believed
+_ROUNDS = 2  # of a film's cameras put on its path and its points made anew, before the last
 _OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
 
 _log = logging.getLogger(__name__)
@@ -111,13 +112,18 @@ def reconstruct(
             _adjust(colmap, models[0], focal is None, distorted)
     if not models:
         raise InputError(f"{folder.name}: {_why_none(matches)}")
-    models[0] = _triangulated(
-        colmap, database, folder, workspace, _mapping(colmap, focal, strict, distorted), models[0]
-    )
+    sizes = [one.num_reg_images() for one in models]
+    options = _mapping(colmap, focal, strict, distorted)
+    triangulated = partial(_triangulated, colmap, database, folder, workspace, options)
+    models[0] = triangulated(models[0])
     _adjust(colmap, models[0], focal is None, distorted)
-    model, features = _model(models[0], [m.num_reg_images() for m in models])
+    model, features = _model(models[0], sizes)
     if times is not None:
-        model = put_on_path(model, features, dict(zip(names, times, strict=True)))
+        when = dict(zip(names, times, strict=True))
+        for _ in range(_ROUNDS):
+            model = on_path(model, features, _times_of(model, when), _SOFT)
+            model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
+        model = put_on_path(model, features, when)
     model = _checked(model, matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -284,7 +290,7 @@ def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: P
     """The model with its points made anew: tracks that broke while poses were worse are whole, and hold together
     parts of a film that stood askew."""
     output = workspace / "triangulated"
-    output.mkdir()
+    output.mkdir(exist_ok=True)
     return _run(
         colmap,
         lambda token: colmap.triangulate_points(
@@ -293,13 +299,27 @@ def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: P
     )
 
 
+def _with_poses(colmap: ModuleType, model: Any, found: SfmModel) -> Any:
+    """The model with the poses that were found since."""
+    for name, pose in zip(found.names, found.world_from_camera, strict=True):
+        turn = pose[:3, :3].T
+        placed = colmap.Rigid3d(colmap.Rotation3d(turn), -turn @ pose[:3, 3])
+        model.find_image_with_name(name).frame.rig_from_world = placed
+    return model
+
+
+def _times_of(model: SfmModel, times: Mapping[str, float]) -> Array:
+    """[N] of its pictures."""
+    return np.array([times[name] for name in model.names], np.float64)
+
+
 def put_on_path(model: SfmModel, features: Features, times: Mapping[str, float]) -> SfmModel:
     """A film's model with its cameras on a smooth path (`path.on_path`), without those that stray from it all the same
     (`path.strays`), with a warning.
 
     times: of the pictures by their names, as `reconstruct` has them
     """
-    when = np.array([times[name] for name in model.names], np.float64)
+    when = _times_of(model, times)
     model = on_path(model, features, when, _SOFT)
     distances = np.array([_depths(model, k) for k in range(len(model.names))])
     lost = strays(model.positions, when, distances)
