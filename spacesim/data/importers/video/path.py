@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.geometry import Array
@@ -32,6 +33,7 @@ class Features:
     pixels: Array  #: [F, 2]
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane: a cost that is refused
 def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
     """The model with poses and points adjusted to features and to a smooth path of the cameras' positions.
 
@@ -122,9 +124,8 @@ def _solved(normal: sparse.csr_array, right: Array, points: int) -> Array:
     blocks = np.linalg.inv(normal[cameras:, cameras:].tobsr((3, 3)).data)
     inverse = sparse.bsr_array((blocks, np.arange(points), np.arange(points + 1)))
     share = mixed @ inverse
-    first = np.linalg.solve(
-        (normal[:cameras, :cameras] - share @ mixed.T).toarray(), right[:cameras] - share @ right[cameras:]
-    )
+    reduced = normal[:cameras, :cameras] - share @ mixed.T
+    first = spsolve(reduced.tocsc(), right[:cameras] - share @ right[cameras:])
     return np.r_[first, inverse @ (right[cameras:] - mixed.T @ first)]
 
 
