@@ -93,6 +93,8 @@ def test_what_is_seen_well_stays_and_a_frame_begun_wrong_is_found():
     found = on_path(replace(model, world_from_camera=poses), features, np.arange(30.0), SOFT)
     np.testing.assert_allclose(found.positions, true, atol=1e-3)
     assert found.errors.max() < 0.05  # pixels
+    broken = replace(features, pixels=np.where(features.points[:, None] == 3, np.nan, features.pixels))
+    assert on_path(model, broken, np.arange(30.0), SOFT) is model
     few = replace(model, names=model.names[:5])
     assert on_path(few, features, np.arange(5.0), SOFT) is few
 

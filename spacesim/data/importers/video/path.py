@@ -41,7 +41,7 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
     little, over the mean number of a point's features: what moves one moves the others alike. The cost of a departure
     from the path is Cauchy's, too, in units of the median departure before, so that a shaking hand is left to
     shake, and a cut is none. Levenberg's and Marquardt's steps, float64; the first camera and one coordinate of the
-    farthest stay. A film of fewer than twelve pictures is returned as it is.
+    farthest stay. A film of fewer than twelve pictures is returned as it is, and one whose cost is not finite.
 
     features: of this model's pictures and points; times: [N] of its pictures, rising, of any unit; soft: pixels
     """
@@ -54,6 +54,8 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
     held = [*range(6), 6 * far + 3 + int(np.argmax(np.abs(model.positions[far] - model.positions[0])))]
     free = np.setdiff1d(np.arange(6 * count + 3 * len(model.points)), held)
     cost, damping = problem.cost(*state), 1e-4
+    if not np.isfinite(cost):
+        return model
     for _ in range(_STEPS):
         slopes, residuals = problem.linearized(*state)
         slopes = slopes[:, free]
