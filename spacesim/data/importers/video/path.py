@@ -39,9 +39,12 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
 
     The cost of a feature that is d pixels off is log(1 + (d / soft)^2), Cauchy's, so that highlights, which move, pull
     little, over the mean number of a point's features: what moves one moves the others alike. The cost of a departure
-    from the path is Cauchy's, too, in units of the median departure before, so that a shaking hand is left to
-    shake, and a cut is none. Levenberg's and Marquardt's steps, float64; the first camera and one coordinate of the
-    farthest stay. A film of fewer than twelve pictures is returned as it is, and one whose cost is not finite.
+    from the path is Cauchy's, too, in units of the median departure before, so that a cut is none. A hand that shakes
+    is pulled to a smoother path, and further by each call, as that unit is then smaller; times that are not the
+    pictures' own, as frame numbers of a film of varying rate, make a model worse.
+
+    Levenberg's and Marquardt's steps, float64; the first camera and one coordinate of the farthest stay. A film of
+    fewer than twelve pictures is returned as it is, and one whose cost is not finite.
 
     features: of this model's pictures and points; times: [N] of its pictures, rising, of any unit; soft: pixels
     """
