@@ -29,6 +29,12 @@ def normalize(vectors: ArrayLike) -> Array:
     return vectors / lengths
 
 
+def cross_matrix(vector: Array) -> Array:
+    """[3, 3] of the cross product with a vector [3] from the left."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def perpendicular(direction: Array) -> Array:
     """[3] a unit vector that stands upright on a `direction` [3] of any length above 0."""
     return normalize(np.cross(np.eye(3)[np.abs(direction).argmin()], direction))

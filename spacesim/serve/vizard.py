@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, cross_matrix
 from spacesim.data.images import png_bytes
 from spacesim.data.records import Camera, Sun
 from spacesim.serve import wire
@@ -42,8 +42,7 @@ _log = logging.getLogger(__name__)
 def rotation_from_mrp(mrp: Array) -> Array:
     """[3, 3] the matrix [BN] that takes components in N to those in B, by the modified Rodrigues parameters [3] of B
     relative to N (Schaub and Junkins, Analytical Mechanics of Space Systems, equation 3.152)."""
-    x, y, z = mrp
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = cross_matrix(mrp)
     square = float(mrp @ mrp)
     return np.eye(3) + (8 * cross @ cross - 4 * (1 - square) * cross) / (1 + square) ** 2
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from spacesim.backend.arrays import Float
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, cross_matrix
 from spacesim.data.records import Camera
 from spacesim.splat.pose.motion import Pivot, moved
 from spacesim.splat.pose.picture import GAINS, SunlitRun, reduced, smoothed
@@ -184,9 +184,8 @@ class PyramidLevel:
 
     def twists(self, camera: Camera) -> Array:
         """[6, 6] derivative of the twist of `moved` by the first six unknowns, at 0."""
-        x, y, z = self.pivot.seen_by(camera)
         jacobian = np.eye(6)
-        jacobian[3:, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]  # v = shift + middle x turn
+        jacobian[3:, :3] = cross_matrix(self.pivot.seen_by(camera))  # v = shift + middle x turn
         return jacobian * self.units(camera)
 
 

@@ -135,7 +135,7 @@ def scale_warning(dataset: Dataset) -> str:
 def _is_cut_off(dataset: Dataset, centre: np.ndarray) -> bool:
     """Whether points or the mesh lie before training cameras and nearer than `NEAR`; without either, whether a tenth
     of the cameras are within twice that of `centre`: the random start then reaches there."""
-    points = _known_points(dataset)
+    points = known_points(dataset)
     if points is None or not len(points):
         distances = [np.linalg.norm(frame.camera.position - centre) for frame in dataset.train]
         return bool(np.quantile(distances, 0.1) < 2 * NEAR)
@@ -145,7 +145,7 @@ def _is_cut_off(dataset: Dataset, centre: np.ndarray) -> bool:
     return bool(((depth > 0) & (depth < NEAR)).sum() > CUT_OFF * (depth > 0).sum())
 
 
-def _known_points(dataset: Dataset) -> np.ndarray | None:
+def known_points(dataset: Dataset) -> np.ndarray | None:
     """[N, 3] metres: the dataset's points, else corners of its mesh's triangles, else None."""
     if dataset.ply_file_path is not None:
         return read_points(dataset.root / dataset.ply_file_path)[0].astype(np.float64)

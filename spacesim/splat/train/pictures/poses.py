@@ -31,9 +31,8 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
-from spacesim.data.geometry import Array, fibonacci_sphere
+from spacesim.data.geometry import Array, cross_matrix, fibonacci_sphere
 from spacesim.data.records import Camera, Dataset
-from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point
 from spacesim.splat.pose import moved, twist_between
 from spacesim.splat.raster.gaussians import Gaussians
@@ -41,13 +40,14 @@ from spacesim.splat.raster.project import Pinhole, Splats, project
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.adam import OWN
 from spacesim.splat.train.pictures.numbers import PictureNumbers, falling
+from spacesim.splat.train.start import known_points
 
 START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
 ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
 BELIEVED = 3.0  #: times what cameras share that err apart from each other, root mean square
-RADIUS = 0.25  #: of an object without points, in widths of the picture
+RADIUS = 0.25  #: of an object without points, of its distance
 POINTS = 200  #: of those that training starts at, by whose motion the gauge is held
 WAYS = ("opacity", "x", "y", "a", "b", "c")  #: of a splat's numbers that blending differentiates by
 
@@ -192,7 +192,7 @@ def pose_gradient(
 
 def left_jacobian(turn: Array) -> Array:
     """[3, 3] J of SO(3): exp([w + dw]) = exp([J dw]) exp([w]) to first order."""
-    angle, cross = float(np.linalg.norm(turn)), _crossed(turn)
+    angle, cross = float(np.linalg.norm(turn)), cross_matrix(turn)
     if angle < 1e-6:
         return np.eye(3) + 0.5 * cross
     half = (1 - np.cos(angle)) / angle**2
@@ -200,18 +200,11 @@ def left_jacobian(turn: Array) -> Array:
     return jacobian
 
 
-def _crossed(vector: Array) -> Array:
-    """[3, 3] of the cross product with `vector` from the left."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
 def _object_of(dataset: Dataset) -> tuple[Array, Array]:
     """(its centre [3], some of its points [P, 3], none where training starts without any)."""
-    path = dataset.ply_file_path or dataset.mesh_path
-    if path is None:
+    points = known_points(dataset)
+    if points is None:
         return focus_point(dataset), np.zeros((0, 3))
-    points = read_points(dataset.root / path)[0].astype(np.float64)
     return np.median(points, axis=0), points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
 
 
@@ -228,11 +221,11 @@ class _Gauge:
     def of(cameras: list[Camera], centre: Array, seen: Array, distances: Array, points: Array) -> "_Gauge":
         common, moves = np.zeros((len(cameras), 6, 7)), np.zeros((len(cameras), 6, 6))
         for i, (camera, middle, distance) in enumerate(zip(cameras, seen, distances, strict=True)):
-            back = np.block([[np.eye(3), np.zeros((3, 3))], [-_crossed(middle / distance), -np.eye(3)]])
+            back = np.block([[np.eye(3), np.zeros((3, 3))], [-cross_matrix(middle / distance), -np.eye(3)]])
             # (turn w, shift of the camera per distance) = back (w, u), its own inverse: the shift is w x m / d - u
             axes, arm = camera.camera_from_world[:3, :3], camera.position - centre
             common[i, :3, :3] = -axes
-            common[i, 3:, :3] = -axes @ _crossed(arm) / distance
+            common[i, 3:, :3] = -axes @ cross_matrix(arm) / distance
             common[i, 3:, 3:6] = axes / distances.mean()
             common[i, 3:, 6] = axes @ arm / distance
             common[i] = back @ common[i]
@@ -240,7 +233,7 @@ class _Gauge:
             local = local[local[:, 2] > 0.1 * distance]
             if len(local) < 8:
                 local = middle + RADIUS * distance * fibonacci_sphere(32)
-            turned = np.array([_crossed(middle - point) for point in local])
+            turned = np.array([cross_matrix(middle - point) for point in local])
             slopes = np.concatenate([turned, np.broadcast_to(distance * np.eye(3), turned.shape)], axis=2)
             flat = slopes[:, :2] - (local[:, :2] / local[:, 2:])[:, :, None] * slopes[:, 2:]
             flat *= np.array([[camera.fx], [camera.fy]]) / (camera.width * local[:, 2, None, None])
