@@ -106,8 +106,8 @@ def as_trained(own: Dataset, run: Path) -> Dataset:
     if not path.is_file():
         return own
     views = read_views(path)
-    known = (views.get(frame.file_path, frame).camera for frame in own.train)
-    return replace(own, train=tuple(replace(f, camera=c) for f, c in zip(own.train, known, strict=True)))
+    train = (replace(frame, camera=views.get(frame.file_path, frame).camera) for frame in own.train)
+    return replace(own, train=tuple(train))
 
 
 def moved_dataset(dataset: Dataset, pose: Pose) -> Dataset:

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.importers.video import path
 from spacesim.data.importers.video.model import SfmModel
-from spacesim.data.importers.video.path import Features, on_path, strays
-from spacesim.data.importers.video.sfm import put_on_path
+from spacesim.data.importers.video.path import Features, on_path, put_on_path, strays
 
 SOFT = 0.3
 
@@ -111,7 +110,7 @@ def test_a_frame_whose_features_are_elsewhere_is_left_out(caplog):
     places = arc(20)
     places[12] *= 1.03
     model, features = filmed(places)
-    found = put_on_path(model, features, {name: float(k) for k, name in enumerate(model.names)})
+    found = put_on_path(model, features, np.arange(20.0), SOFT)
     assert found.names == model.names[:12] + model.names[13:]
     assert len(found.world_from_camera) == 19
     assert {k for frames in found.seen_by for k in frames} == set(range(19))

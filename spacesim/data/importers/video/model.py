@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonValue
-from spacesim.data.geometry import Array, normalize
+from spacesim.data.geometry import Array, degrees_between, normalize
 
 EXTENT = 0.5, 99.5  #: percentiles of points along the longest axis between which an object's length lies
 _NEIGHBOURS = 8  # of a point, by whose distance it floats or not
@@ -42,6 +42,11 @@ class SfmModel:
     def positions(self) -> Array:
         """[N, 3] camera centres."""
         return self.world_from_camera[:, :3, 3]
+
+    @property
+    def depths(self) -> Array:
+        """[N] medians of all points' depths before each camera."""
+        return np.array([np.median((self.points - pose[:3, 3]) @ pose[:3, 2]) for pose in self.world_from_camera])
 
 
 def without_floating(model: SfmModel) -> SfmModel:
@@ -154,6 +159,17 @@ def placed(
     poses[:, :3, :3] = rotation @ poses[:, :3, :3]
     poses[:, :3, 3] = scale * (model.positions - middle) @ rotation.T
     return replace(model, world_from_camera=poses, points=scale * offsets @ rotation.T)
+
+
+def median_angle(model: SfmModel) -> float:
+    """Degrees between the two rays furthest apart on which the median point is seen."""
+    centres = model.world_from_camera[:, :3, 3]
+    angles = []
+    for point, frames in zip(model.points, model.seen_by, strict=True):
+        rays = centres[list(frames)] - point
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(degrees_between((rays @ rays.T).min()))
+    return float(np.median(angles))
 
 
 def arc_of(model: SfmModel) -> float:

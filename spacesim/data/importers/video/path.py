@@ -5,6 +5,7 @@ by half a degree, at no cost in pixels. A camera does not jump: of four pictures
 parabola through the others would have it.
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.geometry import Array
-from spacesim.data.importers.video.model import SfmModel
+from spacesim.data.importers.video.model import SfmModel, without_pictures
 
 _ROW = 4  # pictures whose places are compared: the third difference is nought on a parabola
 _LEAST_PICTURES = 12
@@ -22,6 +23,8 @@ _BESIDE = 4  # pictures of a film before and after one, by which its place is to
 _STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
 _LEAST_STRAY = 0.005  # of the distance
 _STEPS, _ENOUGH = 30, 1e-5  # at most; share of the cost by which a step must lower it
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,16 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
     away = np.linalg.norm(problem.off(*state)[0], axis=1)
     sums, counts = (np.bincount(features.points, weights, len(model.points)) for weights in (away, None))
     return replace(model, world_from_camera=poses, points=state[2], errors=sums / np.maximum(counts, 1))
+
+
+def put_on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
+    """What `on_path` gives, without the pictures whose cameras stray from the path all the same (`strays`), with a
+    warning."""
+    model = on_path(model, features, times, soft)
+    lost = strays(model.positions, times, model.depths)
+    if lost:
+        _log.warning("left out, off the camera's smooth path: %s", ", ".join(model.names[k] for k in lost))
+    return without_pictures(model, lost)
 
 
 def strays(positions: Array, times: Array, distances: Array) -> list[int]:
@@ -146,13 +159,16 @@ class _Problem:
         weights = 1 / gaps.prod(axis=2)
         self.weights = weights / np.linalg.norm(weights, axis=1, keepdims=True)
         around = np.linalg.norm(model.positions - np.median(model.points, axis=0), axis=1)
-        self.sizes = around[self.rows].mean(axis=1)
-        departures = np.linalg.norm(self.departures(model.positions), axis=1)
-        self.sizes *= max(float(np.median(departures)), _LEAST_DEPARTURE)
+        distances = around[self.rows].mean(axis=1)
+        shares = np.linalg.norm(self._off_path(model.positions) / distances[:, None], axis=1)
+        self.sizes = distances * max(float(np.median(shares)), _LEAST_DEPARTURE)
 
     def departures(self, positions: Array) -> Array:
-        """[R, 3] from a parabola, of distances; after the first call of the median one."""
-        return np.asarray(np.einsum("rk,rki->ri", self.weights, positions[self.rows]) / self.sizes[:, None])
+        """[R, 3] from a parabola, of the median one before."""
+        return self._off_path(positions) / self.sizes[:, None]
+
+    def _off_path(self, positions: Array) -> Array:
+        return np.asarray(np.einsum("rk,rki->ri", self.weights, positions[self.rows]))
 
     def off(self, rotations: Array, positions: Array, points: Array) -> tuple[Array, Array]:
         """(pixels off [F, 2], features' points in camera axes [F, 3])."""

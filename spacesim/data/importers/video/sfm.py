@@ -7,7 +7,7 @@ that Ctrl-C is heard: it ends them through pycolmap's own token.
 import importlib
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,9 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.geometry import Array, degrees_between
-from spacesim.data.importers.video.model import SfmModel, without_pictures
-from spacesim.data.importers.video.path import Features, on_path, strays
+from spacesim.data.importers.video.model import SfmModel, median_angle
+from spacesim.data.importers.video.path import Features, on_path, put_on_path
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
@@ -68,8 +67,8 @@ def reconstruct(
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
-    times: of the pictures in their film, rising, of any unit: cameras are then put on a smooth path (`path.on_path`),
-    and left out with a warning where they stray from it all the same (`path.strays`)
+    times: of the pictures in their film, rising, of any unit: cameras are then put on a smooth path, and left out with
+    a warning where they stray from it all the same (`path.put_on_path`)
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
@@ -119,11 +118,12 @@ def reconstruct(
     _adjust(colmap, models[0], focal is None, distorted)
     model, features = _model(models[0], sizes)
     if times is not None:
-        when = dict(zip(names, times, strict=True))
+        by_name = dict(zip(names, times, strict=True))
+        when = np.array([by_name[name] for name in model.names], np.float64)
         for _ in range(_ROUNDS):
-            model = on_path(model, features, _times_of(model, when), _SOFT)
+            model = on_path(model, features, when, _SOFT)
             model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
-        model = put_on_path(model, features, when)
+        model = put_on_path(model, features, when, _SOFT)
     model = _checked(model, matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
@@ -308,26 +308,6 @@ def _with_poses(colmap: ModuleType, model: Any, found: SfmModel) -> Any:
     return model
 
 
-def _times_of(model: SfmModel, times: Mapping[str, float]) -> Array:
-    """[N] of its pictures."""
-    return np.array([times[name] for name in model.names], np.float64)
-
-
-def put_on_path(model: SfmModel, features: Features, times: Mapping[str, float]) -> SfmModel:
-    """A film's model with its cameras on a smooth path (`path.on_path`), without those that stray from it all the same
-    (`path.strays`), with a warning.
-
-    times: of the pictures by their names, as `reconstruct` has them
-    """
-    when = _times_of(model, times)
-    model = on_path(model, features, when, _SOFT)
-    distances = np.array([_depths(model, k) for k in range(len(model.names))])
-    lost = strays(model.positions, when, distances)
-    if lost:
-        _log.warning("left out, off the camera's smooth path: %s", ", ".join(model.names[k] for k in lost))
-    return without_pictures(model, lost)
-
-
 def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
     """Adjust all of a model but what is known of its lens, by features of which those far off pull little, and return
     the median error, pixels."""
@@ -359,7 +339,7 @@ def _is_bent(colmap: ModuleType, models: Sequence[Any], count: int, focal: bool)
 
 def _doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: bool) -> None:
     """Log a warning where a longer or a shorter focal length fits nearly as well as the one that was found."""
-    depth = float(np.median([_depths(model, k) for k in range(len(model.names))]))
+    depth = float(np.median(model.depths))
     errors = []
     for factor in (1 / _OTHER_FOCAL, _OTHER_FOCAL):
         other = colmap.Reconstruction(found)
@@ -444,30 +424,13 @@ def _checked(model: SfmModel, matches: Matches, count: int, name: str) -> SfmMod
             f"{others}): pictures between them are missing or share too few features"
         )
     check_focal(model.focal, (model.width, model.height), name, ": a broken model; name the field of view with fov")
-    behind = np.mean([_depths(model, k) <= 0 for k in range(registered)])
+    behind = np.mean(model.depths <= 0)
     if behind > 0.05:
         raise InputError(
             f"{name}: expected the object before the cameras, found it behind {100 * behind:.0f} % of them: a "
             "mirrored or broken model"
         )
     return model
-
-
-def median_angle(model: SfmModel) -> float:
-    """Degrees between the two rays furthest apart on which the median point is seen."""
-    centres = model.world_from_camera[:, :3, 3]
-    angles = []
-    for point, frames in zip(model.points, model.seen_by, strict=True):
-        rays = centres[list(frames)] - point
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(degrees_between((rays @ rays.T).min()))
-    return float(np.median(angles))
-
-
-def _depths(model: SfmModel, k: int) -> float:
-    """Median depth of all points before camera k."""
-    pose: Array = model.world_from_camera[k]
-    return float(np.median((model.points - pose[:3, 3]) @ pose[:3, 2]))
 
 
 def _why_none(matches: Matches) -> str:
