@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.importers.video import path
 from spacesim.data.importers.video.model import SfmModel
-from spacesim.data.importers.video.path import Features, on_path, put_on_path, strays
+from spacesim.data.importers.video.path import Features, is_smooth, on_path, strays, without_strays
 
 SOFT = 0.3
 
@@ -98,26 +98,64 @@ def test_what_is_seen_well_stays_and_a_frame_begun_wrong_is_found():
     assert on_path(few, features, np.arange(5.0), SOFT) is few
 
 
-def test_a_cut_and_a_shaking_hand_stay():
-    times, positions = film_path(0.01, 3)
+def with_noise(features: Features, pixels: float, seed: int) -> Features:
+    noise = np.random.default_rng(seed).normal(0, pixels, features.pixels.shape)
+    return replace(features, pixels=features.pixels + noise)
+
+
+def by_features(model: SfmModel, features: Features, times: np.ndarray, monkeypatch) -> SfmModel:
+    """The model adjusted to its features alone."""
+    with monkeypatch.context() as patch:
+        patch.setattr(path, "_DEPARTURE", 1e6)
+        return on_path(model, features, times, SOFT)
+
+
+@pytest.mark.parametrize("pixels", [0.1, 0.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_smooth_film_is_told_from_a_shaking_hand(pixels, seed, monkeypatch):
+    for shake in (0.0, 0.005):
+        times, positions = film_path(shake, seed)
+        model, features = filmed(positions)
+        features = with_noise(features, pixels, seed)
+        found = by_features(model, features, times, monkeypatch)
+        assert is_smooth(found, features, times, SOFT) == (shake == 0)
+
+
+def test_a_smooth_film_is_better_on_its_path_and_its_cut_stays(monkeypatch):
+    times, positions = film_path(0.0, 0)
     model, features = filmed(positions)
-    noise = np.random.default_rng(0).normal(0, 0.2, features.pixels.shape)
-    found = on_path(model, replace(features, pixels=features.pixels + noise), times, SOFT)
-    assert np.linalg.norm(found.positions - positions, axis=1).max() < 0.006
+    features = with_noise(features, 0.3, 0)
+    loose = by_features(model, features, times, monkeypatch)
+    found = on_path(loose, features, times, SOFT)
+    off = [np.linalg.norm(one.positions - positions, axis=1) for one in (found, loose)]
+    assert off[0].mean() < 0.7 * off[1].mean()
+    assert np.linalg.norm(found.positions[40] - found.positions[39]) == pytest.approx(
+        np.linalg.norm(positions[40] - positions[39]), rel=0.01
+    )
+
+
+def test_a_point_behind_a_camera_that_shows_it_has_no_error_that_is_believed():
+    model, features = filmed(arc(14))
+    behind = model.points.copy()
+    behind[5] = 40.0 * model.positions[0]
+    found = on_path(replace(model, points=behind), features, np.arange(14.0), SOFT)
+    assert np.isfinite(np.delete(found.errors, 5)).all()
+    assert found.errors[5] > 2 or np.linalg.norm(found.points[5] - model.points[5]) < 0.01
 
 
 def test_a_frame_whose_features_are_elsewhere_is_left_out(caplog):
     places = arc(20)
     places[12] *= 1.03
     model, features = filmed(places)
-    found = put_on_path(model, features, np.arange(20.0), SOFT)
+    found = without_strays(on_path(model, features, np.arange(20.0), SOFT), np.arange(20.0))
     assert found.names == model.names[:12] + model.names[13:]
     assert len(found.world_from_camera) == 19
     assert {k for frames in found.seen_by for k in frames} == set(range(19))
     assert [record.getMessage() for record in caplog.records] == ["left out, off the camera's smooth path: 012"]
 
 
-def test_slopes_are_those_of_differences():
+def test_slopes_are_those_of_differences(monkeypatch):
+    monkeypatch.setattr(path, "_DEPARTURE", 1e-3)
     model, features = filmed(arc(14), halves=True)
     rng = np.random.default_rng(0)
     features = replace(features, pixels=features.pixels + rng.normal(0, 0.5, features.pixels.shape))

@@ -100,6 +100,7 @@ def import_video(
                 "nothing moves"
             )
         keys: dict[str, dict[str, JsonValue]] = {}
+        seconds: list[float | None] = []
         size: tuple[int, ...] | None = None
         for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
@@ -108,10 +109,16 @@ def import_video(
                     raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
                 name = f"frame_{number:06d}.png"
                 write_png(folder / "pictures" / name, _scaled(frame.picture, settings.height), durable=False)
+                seconds.append(frame.time)
                 keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
-        return _import(
-            src, out, folder, keys, chosen.tolist(), settings, source, tell, {"frames_of_video": len(seen.motion)}
-        )
+        facts: dict[str, JsonValue] = {"frames_of_video": len(seen.motion)}
+        return _import(src, out, folder, keys, _times(seconds, chosen.tolist()), settings, source, tell, facts)
+
+
+def _times(seconds: Sequence[float | None], numbers: Sequence[float]) -> Sequence[float]:
+    """Of a film's frames: seconds, or frame numbers where seconds are missing or do not rise."""
+    known = [one for one in seconds if one is not None]
+    return known if len(known) == len(numbers) and (np.diff(known) > 0).all() else numbers
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:

@@ -57,7 +57,7 @@ def without_floating(model: SfmModel) -> SfmModel:
         points = model.points[kept]
         gaps = cKDTree(points).query(points, _NEIGHBOURS + 1)[0][:, 1:].mean(axis=1)
         kept = kept[gaps <= _FLOATING * np.median(gaps)]
-    return _with_points(model, kept.tolist())
+    return with_points(model, kept.tolist())
 
 
 def without_pictures(model: SfmModel, numbers: Sequence[int]) -> SfmModel:
@@ -67,10 +67,11 @@ def without_pictures(model: SfmModel, numbers: Sequence[int]) -> SfmModel:
     seen_by = tuple(tuple(rows[k] for k in frames if k in rows) for frames in model.seen_by)
     names = tuple(model.names[k] for k in kept)
     model = replace(model, names=names, world_from_camera=model.world_from_camera[kept], seen_by=seen_by)
-    return _with_points(model, [k for k, frames in enumerate(seen_by) if frames])
+    return with_points(model, [k for k, frames in enumerate(seen_by) if frames])
 
 
-def _with_points(model: SfmModel, kept: Sequence[int]) -> SfmModel:
+def with_points(model: SfmModel, kept: Sequence[int]) -> SfmModel:
+    """The model with some of its points only."""
     return replace(
         model,
         points=model.points[kept],

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.geometry import Array
@@ -18,7 +18,9 @@ from spacesim.data.importers.video.model import SfmModel, without_pictures
 
 _ROW = 4  # pictures whose places are compared: the third difference is nought on a parabola
 _LEAST_PICTURES = 12
-_LEAST_DEPARTURE = 1e-5  # of the distance
+_DEPARTURE = 3e-5  # from the path, of the distance
+_SMOOTH = 2.0  # times the square of departures that errors of features explain
+_SAMPLES = 60  # departures, of which these are computed
 _BESIDE = 4  # pictures of a film before and after one, by which its place is told
 _STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
 _LEAST_STRAY = 0.005  # of the distance
@@ -36,29 +38,40 @@ class Features:
     pixels: Array  #: [F, 2]
 
 
+def is_smooth(model: SfmModel, features: Features, times: Array, soft: float) -> bool:
+    """Whether the cameras of a film depart from a smooth path by no more than errors of features explain, which are
+    taken for independent; False of fewer than twelve pictures.
+
+    model: adjusted to the features with Cauchy's cost; others: as for `on_path`
+    """
+    if len(model.names) < _LEAST_PICTURES:
+        return False
+    problem = _Problem(model, features, times, soft)
+    seen = np.square(problem.departures(model.positions)).sum(axis=1)
+    return bool(np.median(seen) < _SMOOTH * np.median(problem.errors_of_departures(*_state(model))))
+
+
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane: a cost that is refused
 def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
     """The model with poses and points adjusted to features and to a smooth path of the cameras' positions.
 
     The cost of a feature that is d pixels off is log(1 + (d / soft)^2), Cauchy's, so that highlights, which move, pull
     little, over the mean number of a point's features: what moves one moves the others alike. The cost of a departure
-    from the path is Cauchy's, too, in units of the median departure before, so that a cut is none. A hand that shakes
-    is pulled to a smoother path, and further by each call, as that unit is then smaller; times that are not the
-    pictures' own, as frame numbers of a film of varying rate, make a model worse.
+    from the path is Cauchy's, too, in units of 3e-5 of the distance and what a circle about the object departs, so
+    that a cut is none. A camera that shakes is pulled to a path that it did not take: see `is_smooth`.
+
+    A point's error is the mean of its features', infinite where a camera that shows it has it behind.
 
     Levenberg's and Marquardt's steps, float64; the first camera and one coordinate of the farthest stay. A film of
     fewer than twelve pictures is returned as it is, and one whose cost is not finite.
 
-    features: of this model's pictures and points; times: [N] of its pictures, rising, of any unit; soft: pixels
+    features: of this model's pictures and points; times: [N] of its pictures, rising strictly, of any unit; soft:
+    pixels
     """
-    count = len(model.names)
-    if count < _LEAST_PICTURES:
+    if len(model.names) < _LEAST_PICTURES:
         return model
-    problem = _Problem(model, features, np.asarray(times, np.float64), soft)
-    state = model.world_from_camera[:, :3, :3], model.positions, model.points
-    far = int(np.argmax(np.linalg.norm(model.positions - model.positions[0], axis=1)))
-    held = [*range(6), 6 * far + 3 + int(np.argmax(np.abs(model.positions[far] - model.positions[0])))]
-    free = np.setdiff1d(np.arange(6 * count + 3 * len(model.points)), held)
+    problem, state = _Problem(model, features, times, soft), _state(model)
+    free = problem.free
     cost, damping = problem.cost(*state), 1e-4
     if not np.isfinite(cost):
         return model
@@ -67,7 +80,7 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
         slopes = slopes[:, free]
         normal, right = slopes.T @ slopes, -(slopes.T @ residuals)
         while damping < 1e6:
-            step = np.zeros(6 * count + 3 * len(model.points))
+            step = np.zeros(problem.unknowns)
             damped = normal + damping * sparse.diags_array(normal.diagonal() + 1e-12)
             step[free] = _solved(damped.tocsr(), right, len(model.points))
             moved = _moved(state, step)
@@ -82,15 +95,14 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
             break
     poses = model.world_from_camera.copy()
     poses[:, :3, :3], poses[:, :3, 3] = state[0], state[1]
-    away = np.linalg.norm(problem.off(*state)[0], axis=1)
+    off, local = problem.off(*state)
+    away = np.where(local[:, 2] > 0, np.linalg.norm(off, axis=1), np.inf)
     sums, counts = (np.bincount(features.points, weights, len(model.points)) for weights in (away, None))
     return replace(model, world_from_camera=poses, points=state[2], errors=sums / np.maximum(counts, 1))
 
 
-def put_on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
-    """What `on_path` gives, without the pictures whose cameras stray from the path all the same (`strays`), with a
-    warning."""
-    model = on_path(model, features, times, soft)
+def without_strays(model: SfmModel, times: Array) -> SfmModel:
+    """The model without the pictures whose cameras stray from the film's path (`strays`), with a warning."""
     lost = strays(model.positions, times, model.depths)
     if lost:
         _log.warning("left out, off the camera's smooth path: %s", ", ".join(model.names[k] for k in lost))
@@ -135,15 +147,24 @@ def _moved(state: _State, step: Array) -> _State:
     return turned, positions + cameras[:, 3:], points + step[6 * len(positions) :].reshape(-1, 3)
 
 
-def _solved(normal: sparse.csr_array, right: Array, points: int) -> Array:
-    """The solution, by the Schur complement: no two points share a feature, theirs are blocks of three at the end."""
+def _state(model: SfmModel) -> _State:
+    return model.world_from_camera[:, :3, :3], model.positions, model.points
+
+
+def _eliminated(normal: sparse.csr_array, points: int) -> tuple[sparse.csc_array, sparse.csr_array, sparse.bsr_array]:
+    """(cameras' own normal matrix, what it shares with points [C, 3 P], the inverse of theirs), the Schur complement:
+    no two points share a feature, theirs are blocks of three at the end."""
     cameras = normal.shape[0] - 3 * points
     mixed = normal[:cameras, cameras:]
     blocks = np.linalg.inv(normal[cameras:, cameras:].tobsr((3, 3)).data)
     inverse = sparse.bsr_array((blocks, np.arange(points), np.arange(points + 1)))
-    share = mixed @ inverse
-    reduced = normal[:cameras, :cameras] - share @ mixed.T
-    first = spsolve(reduced.tocsc(), right[:cameras] - share @ right[cameras:])
+    return (normal[:cameras, :cameras] - mixed @ inverse @ mixed.T).tocsc(), mixed, inverse
+
+
+def _solved(normal: sparse.csr_array, right: Array, points: int) -> Array:
+    reduced, mixed, inverse = _eliminated(normal, points)
+    cameras = reduced.shape[0]
+    first = spsolve(reduced, right[:cameras] - mixed @ (inverse @ right[cameras:]))
     return np.r_[first, inverse @ (right[cameras:] - mixed.T @ first)]
 
 
@@ -154,21 +175,40 @@ class _Problem:
         self.features, self.soft = features, soft
         self.focal, self.k1, self.centre = model.focal, model.k1, np.array(model.centre)
         self.alike = len(features.points) / max(len(np.unique(features.points)), 1)
+        times, positions = np.asarray(times, np.float64), model.positions
         self.rows = np.arange(len(times) - _ROW + 1)[:, None] + np.arange(_ROW)
         gaps = times[self.rows][:, :, None] - times[self.rows][:, None] + np.eye(_ROW)
         weights = 1 / gaps.prod(axis=2)
         self.weights = weights / np.linalg.norm(weights, axis=1, keepdims=True)
-        around = np.linalg.norm(model.positions - np.median(model.points, axis=0), axis=1)
-        distances = around[self.rows].mean(axis=1)
-        shares = np.linalg.norm(self._off_path(model.positions) / distances[:, None], axis=1)
-        self.sizes = distances * max(float(np.median(shares)), _LEAST_DEPARTURE)
+        around = np.linalg.norm(positions - np.median(model.points, axis=0), axis=1)
+        step = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / around[1:]))
+        self.sizes = around[self.rows].mean(axis=1) * (_DEPARTURE + step**3 / np.sqrt(20))  # of 1, -3, 3, -1
+        far = int(np.argmax(np.linalg.norm(positions - positions[0], axis=1)))
+        held = [*range(6), 6 * far + 3 + int(np.argmax(np.abs(positions[far] - positions[0])))]
+        self.unknowns = 6 * len(positions) + 3 * len(model.points)
+        self.free = np.setdiff1d(np.arange(self.unknowns), held)
 
     def departures(self, positions: Array) -> Array:
-        """[R, 3] from a parabola, of the median one before."""
-        return self._off_path(positions) / self.sizes[:, None]
+        """[R, 3] from a parabola, in units."""
+        return np.asarray(np.einsum("rk,rki->ri", self.weights, positions[self.rows])) / self.sizes[:, None]
 
-    def _off_path(self, positions: Array) -> Array:
-        return np.asarray(np.einsum("rk,rki->ri", self.weights, positions[self.rows]))
+    def errors_of_departures(self, rotations: Array, positions: Array, points: Array) -> Array:
+        """Expected squares of departures, in units, for features alone that are independently off by as much as these
+        are (Huber's "Robust statistics", 1981, covariance of an estimate), of at most `_SAMPLES` of them."""
+        off = self.off(rotations, positions, points)[0]
+        shares = 1 / (1 + np.square(off).sum(axis=1) / self.soft**2)
+        slopes = self.linearized(rotations, positions, points)[0][: 2 * len(off), self.free]
+        normal = (slopes.T @ slopes).tocsr() * self.alike
+        reduced = _eliminated(normal + sparse.diags_array(1e-9 * normal.diagonal() + 1e-12).tocsr(), len(points))[0]
+        taken = np.unique(np.linspace(0, len(self.rows) - 1, min(_SAMPLES, len(self.rows))).astype(int))
+        chosen = np.zeros((6 * len(positions), len(taken), 3))
+        for axis in range(3):
+            columns = 6 * self.rows[taken] + 3 + axis
+            chosen[columns, np.arange(len(taken))[:, None], axis] = self.weights[taken] / self.sizes[taken, None]
+        flat = chosen.reshape(len(chosen), -1)[self.free[: reduced.shape[0]]]
+        spread = (flat * splu(reduced).solve(flat)).sum(axis=0).reshape(-1, 3).sum(axis=1)
+        pull = 0.5 * np.square(shares[:, None] * off / self.soft).sum() / len(off)
+        return np.asarray(spread * pull * shares.mean() / np.square(shares).mean() ** 2)
 
     def off(self, rotations: Array, positions: Array, points: Array) -> tuple[Array, Array]:
         """(pixels off [F, 2], features' points in camera axes [F, 3])."""

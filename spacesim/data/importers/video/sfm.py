@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.importers.video.model import SfmModel, median_angle
-from spacesim.data.importers.video.path import Features, on_path, put_on_path
+from spacesim.data.importers.video.model import SfmModel, median_angle, with_points
+from spacesim.data.importers.video.path import Features, is_smooth, on_path, without_strays
 
 INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
@@ -67,8 +67,8 @@ def reconstruct(
 
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
-    times: of the pictures in their film, rising, of any unit: cameras are then put on a smooth path, and left out with
-    a warning where they stray from it all the same (`path.put_on_path`)
+    times: of the pictures in their film, rising strictly, of any unit: cameras are then put on a smooth path, if theirs
+    is one (`path.is_smooth`), and left out with a warning where they stray (`path.without_strays`)
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
@@ -113,6 +113,7 @@ def reconstruct(
         raise InputError(f"{folder.name}: {_why_none(matches)}")
     sizes = [one.num_reg_images() for one in models]
     options = _mapping(colmap, focal, strict, distorted)
+    most = options.mapper.filter_max_reproj_error
     triangulated = partial(_triangulated, colmap, database, folder, workspace, options)
     models[0] = triangulated(models[0])
     _adjust(colmap, models[0], focal is None, distorted)
@@ -120,10 +121,13 @@ def reconstruct(
     if times is not None:
         by_name = dict(zip(names, times, strict=True))
         when = np.array([by_name[name] for name in model.names], np.float64)
-        for _ in range(_ROUNDS):
+        if is_smooth(model, features, when, _SOFT):
+            for _ in range(_ROUNDS):
+                model = on_path(model, features, when, _SOFT)
+                model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
             model = on_path(model, features, when, _SOFT)
-            model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
-        model = put_on_path(model, features, when, _SOFT)
+        model = without_strays(model, when)
+        model = with_points(model, np.flatnonzero(model.errors <= most).tolist())
     model = _checked(model, matches, len(names), folder.name)
     if focal is None:
         _doubt_focal(colmap, models[0], model, distorted)
