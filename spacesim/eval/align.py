@@ -101,11 +101,16 @@ def align(own: Dataset, truth: Dataset) -> Alignment:
 
 
 def as_trained(own: Dataset, run: Path) -> Dataset:
-    """`own` with its training cameras where a run that refined poses has them, in RUN/cameras.json."""
+    """`own` with its training cameras where a run that refined poses has them, in RUN/cameras.json.
+
+    Raises InputError where these are of other frames.
+    """
     path = run / "cameras.json"
     if not path.is_file():
         return own
     views = read_views(path)
+    if not any(frame.file_path in views for frame in own.train):
+        raise InputError(f"{path}: expected cameras of frames of {own.root}, found {', '.join(list(views)[:3])}, ...")
     train = (replace(frame, camera=views.get(frame.file_path, frame).camera) for frame in own.train)
     return replace(own, train=tuple(train))
 

@@ -233,6 +233,10 @@ def test_a_run_is_aligned_by_the_cameras_that_it_refined(drawn, tmp_path, monkey
     metrics = evaluate(run, truth, tmp_path / "eval", EvaluateConfig(align=given))
     assert metrics["image"]["psnr"]["mean"] > 40
     assert metrics["alignment"]["rms"] < 1e-3
+    others = [{**entry, "file_path": f"other/{k}.png"} for k, entry in enumerate(frames)]
+    (run.path / "cameras.json").write_text(json.dumps({"frames": others}))
+    with pytest.raises(InputError, match=r"cameras.json: expected cameras of frames of .*, found other/0.png"):
+        evaluate(run, truth, tmp_path / "other", EvaluateConfig(align=given))
 
 
 def test_data_that_are_not_the_runs_are_noted(drawn, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import fibonacci_sphere
+from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import load_image, read_png, write_png
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.video import frames as frames_of
@@ -317,6 +317,41 @@ def test_poses_of_pictures_are_found(tmp_path):
     assert report["not_registered"] == []
     assert report["reprojection_error_px"] < 1
     assert max(report["extent"]) < 2.1 * np.linalg.norm(BOX)
+
+
+def test_a_films_times_are_its_seconds_where_they_rise():
+    """A frame number is no time where the rate varies."""
+    assert importing._times([0.0, 0.04, 0.2], [0, 1, 5]) == [0.0, 0.04, 0.2]
+    for seconds in ([0.0, None, 0.2], [0.0, 0.2, 0.2], [0.1, 0.0, 0.2]):
+        assert importing._times(seconds, [0, 1, 5]) == [0, 1, 5]
+
+
+@needs_colmap
+def test_parts_that_share_no_view_are_told(tmp_path, caplog):
+    """From one side, then from the other."""
+    for k, pose in enumerate(poses_around(12)):
+        write_png(tmp_path / "in" / f"a{k:02d}.png", box_from(pose)[0])
+    for k, angle in enumerate(np.radians(np.linspace(0, 60, 10))):
+        opposite = look_at(-5 * np.array([0.9 * np.cos(angle), np.sin(angle), 0.45]), np.zeros(3))
+        write_png(tmp_path / "in" / f"b{k:02d}.png", box_from(opposite)[0])
+    data = import_dataset("images", tmp_path / "in", tmp_path / "out", masks="none", fov=FOV)
+    assert len(data.frames) == 12
+    said = [record.getMessage() for record in caplog.records if "have a pose" in record.getMessage()]
+    assert said[0].startswith(f"{tmp_path / 'in'}: 12 of 22 pictures have a pose")
+    assert said[0].endswith("10 fit together, but not to these; import them apart")
+
+
+@needs_colmap
+def test_a_wrong_field_of_view_is_told(tmp_path, caplog):
+    for k, pose in enumerate(poses_around(12)):
+        write_png(tmp_path / "in" / f"{k:02d}.png", box_from(pose)[0])
+    for factor in (1.0, 1.5):
+        caplog.clear()
+        import_dataset("images", tmp_path / "in", tmp_path / f"{factor}", masks="none", fov=factor * FOV)
+        said = [record.getMessage() for record in caplog.records if record.getMessage().startswith("fov: ")]
+        assert len(said) == (factor == 1.5)
+    assert said[0].startswith("fov: the pictures fit better with 4")
+    assert "degrees than with 62.6 as given" in said[0]
 
 
 @needs_av

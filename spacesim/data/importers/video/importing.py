@@ -191,9 +191,11 @@ def _import(
             )
     model = placed(without_floating(reconstruction), settings.length, settings.distance, extent)
     if len(model.names) < REGISTERED * len(names):
+        apart = [size for size in model.sizes[1:] if size >= LEAST]
         _log.warning(
-            "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)",
+            "%s: %d of %d pictures have a pose; the others are left out (structure.json names them)%s",
             src, len(model.names), len(names),
+            f": {' and '.join(map(str, apart))} fit together, but not to these; import them apart" if apart else "",
         )  # fmt: skip
     if (arc := arc_of(model)) < ARC:
         _log.warning(

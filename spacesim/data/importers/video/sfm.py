@@ -1,26 +1,22 @@
 """Structure from motion: poses, one camera and points of pictures of one object, by pycolmap on the CPU.
 
-J. L. Schoenberger, J.-M. Frahm, "Structure-from-motion revisited", CVPR 2016. Steps run in a thread of their own, so
-that Ctrl-C is heard: it ends them through pycolmap's own token.
+J. L. Schoenberger, J.-M. Frahm, "Structure-from-motion revisited", CVPR 2016.
 """
 
-import importlib
-import logging
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from spacesim.data.errors import InputError, WorkError
+from spacesim.data.errors import InputError
+from spacesim.data.importers.video.adjust import SOFT, adjust, doubt_focal, doubt_given, is_bent, library, run
 from spacesim.data.importers.video.model import SfmModel, median_angle, with_points
 from spacesim.data.importers.video.path import Features, is_smooth, on_path, without_strays
 
-INSTALL = "pip install 'spacesim[sfm]'"
 SEED = 1
 EXHAUSTIVE = 60, 300  #: pictures in time order, in any: up to so many each is matched with each
 OVERLAP = 12  #: of more: each is matched with so many next ones, and 2, 4, 8, ... beyond
@@ -32,13 +28,7 @@ FOCAL = 0.2, 90.0  #: of a camera, in longer sides of its pictures
 _LEAST_ANGLE = 2.0  # degrees: of the median point, from which on its depth is known
 _STRICT = 480  # pixels of the longer side for which a match may be off by one; up to four: all of a small object looks
 # like a plane otherwise
-_SOFT = 0.3  # pixels from which on a feature pulls less: highlights move
-_ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
-_BETTER = 0.95  # share of the error that may be left, for distortion to be believed
 _ROUNDS = 2  # of a film's cameras put on its path and its points made anew, before the last
-_OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
-
-_log = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with the step's name, how much of it is done, and of how much."""
@@ -66,7 +56,8 @@ def reconstruct(
     """Poses of the pictures folder/NAME, all of one camera and of `size` (width, height).
 
     masks: a folder of NAME.png, features are taken where they are not black
-    focal: pixels, where it is known; else it is estimated, and a warning is logged where others fit as well
+    focal: pixels, where it is known; else it is estimated. A warning is logged where others fit as well, or better than
+    the known one
     times: of the pictures in their film, rising strictly, of any unit: cameras are then put on a smooth path, if theirs
     is one (`path.is_smooth`), and left out with a warning where they stray (`path.without_strays`)
     workspace: an empty folder for what is needed meanwhile
@@ -77,7 +68,7 @@ def reconstruct(
     The lens has no distortion unless that brings in pictures or a twentieth less error: a small object before a black
     sky says little of it.
     """
-    colmap = _library()
+    colmap = library()
     report = progress or (lambda step, done, total: None)
     database = workspace / "database.db"
     colmap.logging.minloglevel = 3
@@ -104,11 +95,11 @@ def reconstruct(
         )
     find = partial(_map, colmap, database, folder, workspace, focal, strict, len(names), report)
     models, distorted = find(False), False
-    if _is_bent(colmap, models, len(names), focal is None):
+    if is_bent(colmap, models, len(names), focal is None):
         others = find(True)
         if others and (not models or others[0].num_reg_images() >= models[0].num_reg_images()):
             models, distorted = others, True
-            _adjust(colmap, models[0], focal is None, distorted)
+            adjust(colmap, models[0], focal is None, distorted)
     if not models:
         raise InputError(f"{folder.name}: {_why_none(matches)}")
     sizes = [one.num_reg_images() for one in models]
@@ -116,60 +107,24 @@ def reconstruct(
     most = options.mapper.filter_max_reproj_error
     triangulated = partial(_triangulated, colmap, database, folder, workspace, options)
     models[0] = triangulated(models[0])
-    _adjust(colmap, models[0], focal is None, distorted)
+    adjust(colmap, models[0], focal is None, distorted)
     model, features = _model(models[0], sizes)
     if times is not None:
         by_name = dict(zip(names, times, strict=True))
         when = np.array([by_name[name] for name in model.names], np.float64)
-        if is_smooth(model, features, when, _SOFT):
+        if is_smooth(model, features, when, SOFT):
             for _ in range(_ROUNDS):
-                model = on_path(model, features, when, _SOFT)
+                model = on_path(model, features, when, SOFT)
                 model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
-            model = on_path(model, features, when, _SOFT)
+            model = on_path(model, features, when, SOFT)
         model = without_strays(model, when)
         model = with_points(model, np.flatnonzero(model.errors <= most).tolist())
     model = _checked(model, matches, len(names), folder.name)
     if focal is None:
-        _doubt_focal(colmap, models[0], model, distorted)
+        doubt_focal(colmap, models[0], model, distorted)
+    else:
+        doubt_given(colmap, models[0], distorted)
     return model
-
-
-def _library() -> ModuleType:
-    try:
-        return importlib.import_module("pycolmap")
-    except (ImportError, OSError):
-        raise InputError(f"structure from motion: expected pycolmap, found none; type: {INSTALL}") from None
-
-
-T = TypeVar("T")
-
-
-def _run(colmap: ModuleType, work: Callable[[object], T], poll: Callable[[], None] | None = None) -> T:
-    """What `work` gives, which is called with a token that ends it. `poll` is called while it runs."""
-    token = colmap.CancellationToken()
-    results: list[T] = []
-    failures: list[BaseException] = []
-
-    def call() -> None:
-        try:
-            results.append(work(token))
-        except BaseException as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=call, daemon=True)
-    thread.start()
-    try:
-        while thread.is_alive():
-            thread.join(0.25)
-            if poll is not None:
-                poll()
-    except BaseException:
-        token.cancel()
-        thread.join()
-        raise
-    if failures:
-        raise WorkError(f"structure from motion: pycolmap failed ({' '.join(str(failures[0]).split())})")
-    return results[0]
 
 
 def _find_features(
@@ -193,7 +148,7 @@ def _find_features(
             extraction_options=options,
             device=colmap.Device.cpu,
         )
-        _run(colmap, lambda token, extract=extract: extract(cancellation_token=token))  # type: ignore[misc]
+        run(colmap, lambda token, extract=extract: extract(cancellation_token=token))  # type: ignore[misc]
 
 
 def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, strict: float, report: Progress) -> None:
@@ -217,7 +172,7 @@ def _match(colmap: ModuleType, database: Path, count: int, ordered: bool, strict
     else:
         works = [partial(colmap.match_exhaustive, pairing_options=colmap.ExhaustivePairingOptions())]
     for match in works:
-        _run(colmap, lambda token, match=match: match(database, cancellation_token=token, **shared))  # type: ignore[misc]
+        run(colmap, lambda token, match=match: match(database, cancellation_token=token, **shared))  # type: ignore[misc]
     report("matches", 1, 1)
 
 
@@ -260,7 +215,7 @@ def _map(
 
     output = workspace / ("distorted" if distorted else "plain")
     output.mkdir()
-    models = _run(
+    models = run(
         colmap,
         lambda token: colmap.incremental_mapping(
             database, folder, output, options, next_image_callback=another, cancellation_token=token
@@ -295,7 +250,7 @@ def _triangulated(colmap: ModuleType, database: Path, folder: Path, workspace: P
     parts of a film that stood askew."""
     output = workspace / "triangulated"
     output.mkdir(exist_ok=True)
-    return _run(
+    return run(
         colmap,
         lambda token: colmap.triangulate_points(
             model, database, folder, output, options=options, cancellation_token=token
@@ -310,59 +265,6 @@ def _with_poses(colmap: ModuleType, model: Any, found: SfmModel) -> Any:
         placed = colmap.Rigid3d(colmap.Rotation3d(turn), -turn @ pose[:3, 3])
         model.find_image_with_name(name).frame.rig_from_world = placed
     return model
-
-
-def _adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
-    """Adjust all of a model but what is known of its lens, by features of which those far off pull little, and return
-    the median error, pixels."""
-    options = colmap.BundleAdjustmentOptions()
-    options.refine_focal_length, options.refine_extra_params = focal, distorted
-    options.print_summary = False
-    options.ceres.loss_function_type, options.ceres.loss_function_scale = colmap.LossFunctionType.CAUCHY, _SOFT
-    options.ceres.solver_options.num_threads = 1  # equal results
-    options.ceres.solver_options.function_tolerance = 1e-6
-    which = colmap.BundleAdjustmentConfig()
-    for number in model.reg_image_ids():
-        which.add_image(number)
-    which.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = colmap.create_default_bundle_adjuster(options, which, model)
-    _run(colmap, lambda token: adjuster.solve())
-    model.update_point_3d_errors()
-    return float(np.median([point.error for point in model.points3D.values()]))
-
-
-def _is_bent(colmap: ModuleType, models: Sequence[Any], count: int, focal: bool) -> bool:
-    """Whether distortion may help: the first model lacks pictures, or fits better with it. It is adjusted without."""
-    if not models:
-        return True
-    plain = _adjust(colmap, models[0], focal, False)
-    return models[0].num_reg_images() < _ENOUGH * count or (
-        _adjust(colmap, colmap.Reconstruction(models[0]), focal, True) < _BETTER * plain
-    )
-
-
-def _doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: bool) -> None:
-    """Log a warning where a longer or a shorter focal length fits nearly as well as the one that was found."""
-    depth = float(np.median(model.depths))
-    errors = []
-    for factor in (1 / _OTHER_FOCAL, _OTHER_FOCAL):
-        other = colmap.Reconstruction(found)
-        for camera in other.cameras.values():
-            camera.params = [factor * camera.params[0], *camera.params[1:]]
-        for frame in other.frames.values():
-            if frame.has_pose():
-                pose = frame.rig_from_world
-                moved = pose.translation + np.array([0.0, 0.0, (factor - 1) * depth])
-                frame.rig_from_world = colmap.Rigid3d(pose.rotation, moved)
-        errors.append(_adjust(colmap, other, False, distorted))
-    error = float(np.median(model.errors))
-    if min(errors) * _BETTER < error:
-        wide = 2 * np.degrees(np.arctan(0.5 * model.width / model.focal))
-        _log.warning(
-            "the field of view, estimated as %.3g degrees, is uncertain: a focal length %.0f %% %s fits nearly as well "
-            "(%.3g instead of %.3g pixels off); name it with fov",
-            wide, 100 * (_OTHER_FOCAL - 1), "shorter" if errors[0] < errors[1] else "longer", min(errors), error,
-        )  # fmt: skip
 
 
 def _model(model: Any, sizes: list[int]) -> tuple[SfmModel, Features]:
