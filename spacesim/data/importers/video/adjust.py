@@ -13,7 +13,8 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.importers.video.model import SfmModel
 
 INSTALL = "pip install 'spacesim[sfm]'"
-SOFT = 0.3  #: pixels from which on a feature pulls less: highlights move
+_SOFT, _SOFT_SIDE = 0.3, 960  # pixels from which on a feature pulls less, as highlights move; on a longer side of so
+# many and less, on a longer one as many more
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
 _BETTER = 0.95  # share of the error that may be left, for distortion or another focal length to be believed
 _OTHER_FOV = 1.03  # times the one that was given: such a one is another
@@ -62,13 +63,20 @@ def run(colmap: ModuleType, work: Callable[[object], T], poll: Callable[[], None
     return results[0]
 
 
+def soft_pixels(width: int, height: int) -> float:
+    """Pixels from which on a feature that is so far off pulls less."""
+    return _SOFT * max(max(width, height) / _SOFT_SIDE, 1.0)
+
+
 def adjust(colmap: ModuleType, model: Any, focal: bool, distorted: bool) -> float:
     """Adjust all of a model but what is known of its lens, by features of which those far off pull little, and return
     the median error, pixels."""
     options = colmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_extra_params = focal, distorted
     options.print_summary = False
-    options.ceres.loss_function_type, options.ceres.loss_function_scale = colmap.LossFunctionType.CAUCHY, SOFT
+    camera = next(iter(model.cameras.values()))
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = soft_pixels(camera.width, camera.height)
     options.ceres.solver_options.num_threads = 1  # equal results
     options.ceres.solver_options.function_tolerance = 1e-6
     which = colmap.BundleAdjustmentConfig()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.importers.video.adjust import SOFT, adjust, doubt_focal, doubt_given, is_bent, library, run
+from spacesim.data.importers.video.adjust import adjust, doubt_focal, doubt_given, is_bent, library, run, soft_pixels
 from spacesim.data.importers.video.model import SfmModel, median_angle, with_points
 from spacesim.data.importers.video.path import Features, is_smooth, on_path, without_strays
 
@@ -112,11 +112,12 @@ def reconstruct(
     if times is not None:
         by_name = dict(zip(names, times, strict=True))
         when = np.array([by_name[name] for name in model.names], np.float64)
-        if is_smooth(model, features, when, SOFT):
+        soft = soft_pixels(*size)
+        if is_smooth(model, features, when, soft):
             for _ in range(_ROUNDS):
-                model = on_path(model, features, when, SOFT)
+                model = on_path(model, features, when, soft)
                 model, features = _model(triangulated(_with_poses(colmap, models[0], model)), sizes)
-            model = on_path(model, features, when, SOFT)
+            model = on_path(model, features, when, soft)
         model = without_strays(model, when)
         model = with_points(model, np.flatnonzero(model.errors <= most).tolist())
     model = _checked(model, matches, len(names), folder.name)
