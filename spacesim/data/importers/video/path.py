@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
+from scipy.optimize import least_squares
 from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial.transform import Rotation
 
@@ -19,11 +20,13 @@ from spacesim.data.importers.video.model import SfmModel, without_pictures
 _ROW = 4  # pictures whose places are compared: the third difference is nought on a parabola
 _LEAST_PICTURES = 12
 _DEPARTURE = 3e-5  # from the path, of the distance
-_SMOOTH = 2.0  # times the square of departures that errors of features explain
+_SMOOTH = 4.0  # times the square of departures that independent errors explain: those of one point are alike
 _SAMPLES = 60  # departures, of which these are computed
 _BESIDE = 4  # pictures of a film before and after one, by which its place is told
 _STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
 _LEAST_STRAY = 0.005  # of the distance
+_ELSEWHERE = 0.001  # of the distance: a camera that is so far off stands in another optimum
+_NEARLY = 1.1  # times the cost of a camera's features, with which another optimum may begin
 _STEPS, _ENOUGH = 30, 1e-5  # at most; share of the cost by which a step must lower it
 
 _log = logging.getLogger(__name__)
@@ -36,6 +39,59 @@ class Features:
     pictures: np.ndarray  #: [F] numbers
     points: np.ndarray  #: [F] numbers
     pixels: Array  #: [F, 2]
+
+
+def begun_anew(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
+    """The model with cameras that stood in a wrong optimum of their features in a better one.
+
+    Of a flat object, or one seen from ahead, two poses explain a picture nearly as well (G. Schweighofer, A. Pinz,
+    "Robust pose estimation from a planar target", 2006). Each camera is begun anew between those before and after it
+    and adjusted to its features. Where that leads elsewhere at nearly no more cost, it stays there, and all is adjusted
+    to features; if their cost then falls, this is the model, else the one that was given.
+
+    model: adjusted to the features with Cauchy's cost; others: as for `on_path`
+    """
+    poses = model.world_from_camera.copy()
+    others = [k for k in range(1, len(poses) - 1) if _has_other_pose(model, features, times, soft, k, poses)]
+    if not others:
+        return model
+    problem = _Problem(model, features, times, soft, np.inf)
+    found = _adjusted(replace(model, world_from_camera=poses), problem)
+    if not problem.cost(*_state(found)) < problem.cost(*_state(model)):
+        return model
+    _log.info("begun anew between their neighbours: %s", ", ".join(model.names[k] for k in others))
+    return found
+
+
+def _has_other_pose(model: SfmModel, features: Features, times: Array, soft: float, k: int, poses: Array) -> bool:
+    """Whether a camera has another pose that its features explain nearly as well; it is written to poses[k]."""
+    shown = np.flatnonzero(features.pictures == k)
+    one = replace(model, names=model.names[k : k + 1], world_from_camera=model.world_from_camera[k : k + 1])
+    own = Features(np.zeros(len(shown), int), features.points[shown], features.pixels[shown])
+    lens, distance = _Lens(one, own), np.linalg.norm(poses[k, :3, 3] - np.median(model.points, axis=0))
+    share = (times[k] - times[k - 1]) / (times[k + 1] - times[k - 1])
+    before, after = model.world_from_camera[[k - 1, k + 1]]
+    turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
+    begun = before[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+    place = (1 - share) * before[:3, 3] + share * after[:3, 3]
+
+    def pose(step: Array) -> tuple[Array, Array]:
+        turned = begun @ Rotation.from_rotvec(step[:3]).as_matrix()
+        return turned[None], (place + distance * step[3:])[None]
+
+    def cost(rotations: Array, positions: Array) -> float:
+        off = lens.off(rotations, positions, model.points)[0]
+        return float(np.log1p(np.square(off).sum(axis=1) / soft**2).sum())
+
+    found = least_squares(
+        lambda step: lens.off(*pose(step), model.points)[0].ravel(), np.zeros(6), loss="cauchy", f_scale=soft
+    )
+    turned, placed = pose(found.x)
+    is_other = np.linalg.norm(placed[0] - poses[k, :3, 3]) > _ELSEWHERE * distance
+    if is_other and cost(turned, placed) < _NEARLY * cost(poses[k : k + 1, :3, :3], poses[k : k + 1, :3, 3]):
+        poses[k, :3, :3], poses[k, :3, 3] = turned[0], placed[0]
+        return True
+    return False
 
 
 def is_smooth(model: SfmModel, features: Features, times: Array, soft: float) -> bool:
@@ -51,7 +107,6 @@ def is_smooth(model: SfmModel, features: Features, times: Array, soft: float) ->
     return bool(np.median(seen) < _SMOOTH * np.median(problem.errors_of_departures(*_state(model))))
 
 
-@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane: a cost that is refused
 def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> SfmModel:
     """The model with poses and points adjusted to features and to a smooth path of the cameras' positions.
 
@@ -70,8 +125,12 @@ def on_path(model: SfmModel, features: Features, times: Array, soft: float) -> S
     """
     if len(model.names) < _LEAST_PICTURES:
         return model
-    problem, state = _Problem(model, features, times, soft), _state(model)
-    free = problem.free
+    return _adjusted(model, _Problem(model, features, times, soft))
+
+
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane: a cost that is refused
+def _adjusted(model: SfmModel, problem: "_Problem") -> SfmModel:
+    features, state, free = problem.features, _state(model), problem.free
     cost, damping = problem.cost(*state), 1e-4
     if not np.isfinite(cost):
         return model
@@ -168,12 +227,30 @@ def _solved(normal: sparse.csr_array, right: Array, points: int) -> Array:
     return np.r_[first, inverse @ (right[cameras:] - mixed.T @ first)]
 
 
-class _Problem:
-    """Residuals of features and of the path, and their slopes."""
+class _Lens:
+    """What features are off."""
 
-    def __init__(self, model: SfmModel, features: Features, times: Array, soft: float) -> None:
-        self.features, self.soft = features, soft
+    def __init__(self, model: SfmModel, features: Features) -> None:
+        self.features = features
         self.focal, self.k1, self.centre = model.focal, model.k1, np.array(model.centre)
+
+    def off(self, rotations: Array, positions: Array, points: Array) -> tuple[Array, Array]:
+        """(pixels off [F, 2], features' points in camera axes [F, 3])."""
+        pictures = self.features.pictures
+        local = np.einsum("nji,nj->ni", rotations[pictures], points[self.features.points] - positions[pictures])
+        flat = local[:, :2] / local[:, 2:]
+        lens = 1 + self.k1 * np.square(flat).sum(axis=1, keepdims=True)
+        return self.focal * lens * flat + self.centre - self.features.pixels, local
+
+
+class _Problem(_Lens):
+    """Residuals of features and of the path, and their slopes. departure: the path's unit, of the distance"""
+
+    def __init__(
+        self, model: SfmModel, features: Features, times: Array, soft: float, departure: float = _DEPARTURE
+    ) -> None:
+        super().__init__(model, features)
+        self.soft = soft
         self.alike = len(features.points) / max(len(np.unique(features.points)), 1)
         times, positions = np.asarray(times, np.float64), model.positions
         self.rows = np.arange(len(times) - _ROW + 1)[:, None] + np.arange(_ROW)
@@ -182,7 +259,7 @@ class _Problem:
         self.weights = weights / np.linalg.norm(weights, axis=1, keepdims=True)
         around = np.linalg.norm(positions - np.median(model.points, axis=0), axis=1)
         step = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / around[1:]))
-        self.sizes = around[self.rows].mean(axis=1) * (_DEPARTURE + step**3 / np.sqrt(20))  # of 1, -3, 3, -1
+        self.sizes = around[self.rows].mean(axis=1) * (departure + step**3 / np.sqrt(20))  # of 1, -3, 3, -1
         far = int(np.argmax(np.linalg.norm(positions - positions[0], axis=1)))
         held = [*range(6), 6 * far + 3 + int(np.argmax(np.abs(positions[far] - positions[0])))]
         self.unknowns = 6 * len(positions) + 3 * len(model.points)
@@ -209,14 +286,6 @@ class _Problem:
         spread = (flat * splu(reduced).solve(flat)).sum(axis=0).reshape(-1, 3).sum(axis=1)
         pull = 0.5 * np.square(shares[:, None] * off / self.soft).sum() / len(off)
         return np.asarray(spread * pull * shares.mean() / np.square(shares).mean() ** 2)
-
-    def off(self, rotations: Array, positions: Array, points: Array) -> tuple[Array, Array]:
-        """(pixels off [F, 2], features' points in camera axes [F, 3])."""
-        pictures = self.features.pictures
-        local = np.einsum("nji,nj->ni", rotations[pictures], points[self.features.points] - positions[pictures])
-        flat = local[:, :2] / local[:, 2:]
-        lens = 1 + self.k1 * np.square(flat).sum(axis=1, keepdims=True)
-        return self.focal * lens * flat + self.centre - self.features.pixels, local
 
     def cost(self, rotations: Array, positions: Array, points: Array) -> float:
         away = np.square(self.off(rotations, positions, points)[0]).sum(axis=1) / self.soft**2

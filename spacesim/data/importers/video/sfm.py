@@ -15,7 +15,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.importers.video.adjust import adjust, doubt_focal, doubt_given, is_bent, library, run, soft_pixels
 from spacesim.data.importers.video.model import SfmModel, median_angle, with_points
-from spacesim.data.importers.video.path import Features, is_smooth, on_path, without_strays
+from spacesim.data.importers.video.path import Features, begun_anew, is_smooth, on_path, without_strays
 
 SEED = 1
 EXHAUSTIVE = 60, 300  #: pictures in time order, in any: up to so many each is matched with each
@@ -58,8 +58,9 @@ def reconstruct(
     masks: a folder of NAME.png, features are taken where they are not black
     focal: pixels, where it is known; else it is estimated. A warning is logged where others fit as well, or better than
     the known one
-    times: of the pictures in their film, rising strictly, of any unit: cameras are then put on a smooth path, if theirs
-    is one (`path.is_smooth`), and left out with a warning where they stray (`path.without_strays`)
+    times: of the pictures in their film, rising strictly, of any unit: cameras are then begun anew between their
+    neighbours where that fits better, put on a smooth path, if theirs is one (`path.is_smooth`), and left out with a
+    warning where they stray (`path.without_strays`)
     workspace: an empty folder for what is needed meanwhile
 
     Raises InputError where pycolmap is missing, and where the pictures do not fix poses: too few features or matches,
@@ -113,6 +114,7 @@ def reconstruct(
         by_name = dict(zip(names, times, strict=True))
         when = np.array([by_name[name] for name in model.names], np.float64)
         soft = soft_pixels(*size)
+        model = begun_anew(model, features, when, soft)
         if is_smooth(model, features, when, soft):
             for _ in range(_ROUNDS):
                 model = on_path(model, features, when, soft)
