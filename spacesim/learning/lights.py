@@ -92,7 +92,8 @@ def predict_light(
     exposure: float | None = None,
 ) -> Prediction:
     """As `run.predict`, in the light of both sources or of one alone."""
-    without = sun and replace(sun, earth=None)
+    dark = sun and sun.earth and replace(sun.earth, albedo=0.0)  # it hides the Sun as it does
+    without = sun and replace(sun, earth=dark)
     if light == "sun":
         return run.predict(camera, without, normals, exposure)
     seen = run.predict(camera, sun, normals, exposure)

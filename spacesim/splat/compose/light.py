@@ -99,7 +99,7 @@ class EnsembleLight:
         near, towards = pose.camera_in_model(camera), None if self.sun is None else pose.direction_in_model(self.sun)
         direction = b"" if towards is None else towards.tobytes()
         sunlight = self.cache.get(("sunlight", k), direction, lambda: member.sunlight(towards))
-        earth = pose.earth_in_model(self.earth) if member.run.knows_earth else None
+        earth = pose.earth_in_model(self.earth) if member.run.light else None
         alone = None if earth is None else share  # where the Earth shines, too, sunlight alone is dimmed
         key = near.world_from_camera.tobytes(), direction, earth, None if alone is None else self._key_between
 

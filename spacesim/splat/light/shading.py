@@ -44,6 +44,13 @@ class SunEncoding:
     field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
     refine_encoding: Float  #: input of the refinement's network
     beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
+    #: where the Earth hides some of the Sun, the share of it that is left: Float [2] in a list, of light and of colours
+    #: as they are blended; else nothing
+    eclipse: list[Float]
+
+    def left(self, values: list[Float], of: int = 0) -> list[Float]:
+        """What the Earth leaves of sunlight [M]: of light (0), or of colours (1)."""
+        return [v * dr.gather(ad.Float, share, ad.UInt32(of)) for v in values for share in self.eclipse] or values
 
 
 @dataclass
@@ -85,12 +92,12 @@ def shade(
     colors = [mlp.sigmoid(batch.row(output, i)) for i in range(3)]
     occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
-    outputs = _dimmed(colors, [1 - value for value in occlusion], faces)
+    outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
     bounced = []
     if config.bounce:
         bounced = irradiance(_scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], batch)
-    scattered = _scattered(config, field_inputs, bounced, batch)
+    scattered = _scattered(config, field_inputs, inputs.sun.left(bounced), batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
@@ -121,10 +128,10 @@ def shade_picture(
         rows = batch.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
     colors = [mlp.sigmoid(value) for value in outputs]
-    shown = _dimmed(
-        colors, [batch.pad_zeros(value) for value in visibility], sun_facing(field, field_inputs, views, batch)
-    )
-    scattered = _scattered(config, field_inputs, [batch.pad_zeros(light) for light in bounced], batch)
+    faces = sun_facing(field, field_inputs, views, batch)
+    shown = _dimmed(inputs.sun, colors, [batch.pad_zeros(value) for value in visibility], faces)
+    arriving = inputs.sun.left([batch.pad_zeros(light) for light in bounced])
+    scattered = _scattered(config, field_inputs, arriving, batch)
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
@@ -152,11 +159,13 @@ def first_layer_of_features(
     return mlp.first_layer_part(field.shape, weights, items, field.features)
 
 
-def _dimmed(colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
-    """Colours [M] dimmed by visibility ([M] in a list, or nothing), then that as it is shown. faces: of `sun_facing`"""
+def _dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
+    """Colours [M] dimmed by the Earth and by visibility ([M] in a list, or nothing), then that as it is shown. faces:
+    of `sun_facing`"""
+    colors = sun.left(colors, of=1)
     if not visibility:
         return colors
-    return [color * visibility[0] for color in colors] + [_picture_visibility(visibility[0], faces)]
+    return [color * visibility[0] for color in colors] + sun.left([_picture_visibility(visibility[0], faces)])
 
 
 def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
@@ -196,11 +205,11 @@ def adjoint(
     grad_albedo: list[Float] = []
     grad_earth: list[Float] = []
     if tape.scattered:
-        dimmed = [color * visibility for color in tape.colors]
+        dimmed = [color * visibility for color in inputs.sun.left(tape.colors, of=1)]
         gradients, grad_albedo, grad_earth = _scattered_adjoint(
             config, inputs, gradients, dimmed, tape.scattered, batch
         )
-    pairs = list(zip(gradients, tape.colors, strict=True))
+    pairs = list(zip(inputs.sun.left(gradients, of=1), tape.colors, strict=True))
     grad_output = batch.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     grad_weights, grad_items = mlp.backward(
         config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output
@@ -209,7 +218,7 @@ def adjoint(
     if config.field.embeddings or by_sun:
         by_encoding = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
     parts = [(grad_items, 0, config.field.features)]
-    grad_shown = [batch.pad_zeros(gradient) for gradient in grad_visibility]
+    grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
     grad_sun = []
     if by_sun:
