@@ -1,4 +1,4 @@
-"""The Earth as a source of light: a Lambertian sphere, lit by the Sun, that fills part of the sky and may hide the Sun."""
+"""The Earth as a source of light: a Lambertian sphere, lit by the Sun, that fills part of the sky and can hide it."""
 
 import math
 from dataclasses import dataclass

@@ -1,5 +1,6 @@
 """Which sources light a picture, as commands and scripts name them: the Sun, the Earth that it lights, or both."""
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol, get_args
@@ -10,8 +11,10 @@ from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images.tone import display_values, linear_from_display
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.learning.prediction import MaterialView, Prediction
+
+log = logging.getLogger(__name__)
 
 Light = Literal["all", "sun", "earth"]  #: of both sources, or of one alone
 Named = tuple[float, float] | Literal["none"] | None  #: azimuth and elevation, degrees; "none"; or nothing is said
@@ -92,12 +95,26 @@ def predict_light(
     exposure: float | None = None,
 ) -> Prediction:
     """As `run.predict`, in the light of both sources or of one alone."""
-    dark = sun and sun.earth and replace(sun.earth, albedo=0.0)  # it hides the Sun as it does
-    without = sun and replace(sun, earth=dark)
+    without = sun
+    if sun is not None and sun.earth is not None:
+        without = replace(sun, earth=replace(sun.earth, albedo=0.0))  # which hides the Sun as it does
     if light == "sun":
         return run.predict(camera, without, normals, exposure)
     seen = run.predict(camera, sun, normals, exposure)
     return added_light(seen, run.predict(camera, without, exposure=exposure)) if light == "earth" else seen
+
+
+def sunlit_frames(dataset: Dataset) -> list[int]:
+    """Which training frames a method that takes the Sun trains on: not those whose Sun the Earth hides; a sentence says
+    how many. Raises InputError where it hides every one."""
+    frames = dataset.train
+    sunlit = [number for number, frame in enumerate(frames) if frame.sun is None or not frame.sun.is_hidden]
+    if not sunlit:
+        raise InputError(f"{dataset.root}: expected a training frame whose Sun the Earth does not hide, found none")
+    if len(sunlit) < len(frames):
+        dark = len(frames) - len(sunlit)
+        log.warning("%d of %d training frames are left out: the Earth hides their Sun", dark, len(frames))
+    return sunlit
 
 
 def added_light(prediction: Prediction, to: Prediction) -> Prediction:
