@@ -103,7 +103,7 @@ class Viewer:
         self._sun: SunControls | None = None
         handle = None
         if setup.renderer.relightable and setup.state.sun is not None:
-            self._sun = SunControls(server.gui, self.shared, setup.renderer.knows_earth)
+            self._sun = SunControls(server.gui, self.shared)
             handle = SunHandle(server.scene, setup.renderer, self.shared, self._sun.drag)
         self._models = ModelControls(server.gui, setup.renderer, self.shared, gizmos, handle)
         self.paths = PathControls(server.gui, setup.renderer, self.shared, self._client, self.set_state, setup.path)

@@ -42,9 +42,9 @@ class Panel:
             asyncio.run(listener(SimpleNamespace(client=1)))
 
 
-def controls(sun: Sun = SUN, knows_earth: bool = True) -> tuple[Panel, SharedScene, SunControls]:
+def controls(sun: Sun = SUN) -> tuple[Panel, SharedScene, SunControls]:
     panel, shared = Panel(), SharedScene(SceneState((), sun))
-    return panel, shared, SunControls(panel, shared, knows_earth)
+    return panel, shared, SunControls(panel, shared)
 
 
 def test_the_box_takes_the_earth_away_and_brings_it_back():

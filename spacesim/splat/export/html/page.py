@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import math
 import re
 import zlib
 from collections.abc import Callable
@@ -85,6 +86,8 @@ def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth |
         arrays["normals"] = _normals(gaussians, light.config.field.features)
     if run.curve:
         about["curve"] = {"tone": run.curve.tone, "white": run.curve.white}
+    if earth is not None:
+        about["earth"] = {"direction": earth.direction.tolist(), "radius": math.radians(earth.angular_radius_deg)}
     if sunlight is not None:
         _add_sunlight(sunlight, about, arrays)
     return about, arrays
