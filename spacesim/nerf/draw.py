@@ -11,8 +11,8 @@ from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
-from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.reflectance import eclipse_numbers, past_earth
 from spacesim.nerf.config import CHUNK, NerfConfig
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
@@ -62,14 +62,13 @@ def sample_field(
     density, color, _ = networks.field.look_up(own, point, direction, towards)
     if sun is None or towards is None:
         return RaySamples(low, high, density, color)
-    of_light, of_color = (dr.gather(ad.Float, sun, ad.UInt32(i)) for i in (3, 4))
-    color = [channel * of_color for channel in color]
     if not networks.config.casts_shadows:
-        return RaySamples(low, high, density, color)
+        return RaySamples(low, high, density, past_earth(color, sun, at=3)[0])
     made = volume_weights(density * lengths, samples)
     seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
     visibility = spread(seen, samples)
-    return RaySamples(low, high, density, mix(color, visibility), visibility * of_light)
+    dimmed, _ = past_earth(mix(color, visibility), sun, at=3)
+    return RaySamples(low, high, density, dimmed, visibility * dr.gather(ad.Float, sun, ad.UInt32(3)))
 
 
 def draw_rays(
@@ -220,9 +219,8 @@ def _rays(cameras: Float, pixel: UInt32, width: UInt32, extent: Float) -> Rays:
 
 
 def sun_numbers(towards: Array, sun: Sun) -> Float:
-    """[5]: the direction `towards` a Sun in the field's axes, then how much of it the Earth leaves: the share of its
-    light, and that of colours, which are sRGB values."""
-    return upload(np.array([*towards, sun.visible_share, srgb_from_linear(sun.visible_share)]))
+    """[5]: the direction `towards` a Sun in the field's axes, then `eclipse_numbers`."""
+    return upload(np.concatenate([towards, eclipse_numbers(sun.visible_share, linear=False)]))
 
 
 def _towards(sun: Float | None) -> Array3f | None:

@@ -57,27 +57,25 @@ function interpolateRow(table, side, width, sun) {
   return row;
 }
 
-/** The share of colours that the Earth leaves of a Sun 1 au away: before its disc the limb is a straight line. */
-function pastEarth(sun, { direction, radius }, linear) {
+/** The share that the Earth leaves of a Sun 1 au away: before its disc the limb is a straight line. */
+function pastEarth(sun, { direction, radius }) {
   const c = Math.acos(Math.min(Math.max(sun.reduce((sum, s, i) => sum + s * direction[i], 0), -1), 1));
   const x = Math.min(Math.max((c - radius) / 0.0046505, -1), 1);
-  const share = 0.5 + (x * Math.sqrt(1 - x * x) + Math.asin(x)) / Math.PI;
-  if (linear) return share;
-  return share < 0.0031308 ? 12.92 * share : 1.055 * share ** (1 / 2.4) - 0.055;
+  return 0.5 + (x * Math.sqrt(1 - x * x) + Math.asin(x)) / Math.PI;
 }
 
 /** Write what a Sun gives each Gaussian into `front` and `back` [N, 4]: light that bounces onto the side to which its
  * normal points, and onto the other; in front's alpha how much of the Sun it sees. */
 function lightUp(about, arrays, sun, front, back) {
-  const { count, shadows, bounce, earth, curve } = about, left = earth ? pastEarth(sun, earth, curve) : 1;
-  for (let i = 0; i < count; i++) front[4 * i + 3] = left;
+  const { count, shadows, bounce } = about;
+  for (let i = 0; i < count; i++) front[4 * i + 3] = 1;
   if (shadows) {
     const cells = octahedralCells(sun, shadows.side), stride = (shadows.side * shadows.side) / 2;
     for (let i = 0; i < count; i++) {
       let seen = 0; // two directions a byte, 0 to 15 each
       for (const [cell, share] of cells)
         seen += share * ((arrays.visibility[i * stride + (cell >> 1)] >> (4 * (cell & 1))) & 15);
-      front[4 * i + 3] *= seen / 15;
+      front[4 * i + 3] = seen / 15;
     }
   }
   if (bounce) {

@@ -18,8 +18,8 @@ from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
-from spacesim.data.images import srgb_from_linear
 from spacesim.learning import mlp
+from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
@@ -356,7 +356,7 @@ class LightModel:
         if earth and earth.albedo > 0 and self.config.earth:
             beams = [upload(earth.beams(np.array(sun)))]
         if earth and (share := earth.visible_sun(np.array(sun))) < 1:
-            eclipse = [upload(np.array([share, share if self.config.linear else srgb_from_linear(share)]))]
+            eclipse = [upload(eclipse_numbers(share, self.config.linear))]
         terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams, eclipse)
         dr.eval(terms)
         return terms

@@ -11,6 +11,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf
 from spacesim.learning import mlp
 from spacesim.learning.mlp import round_up_rows
+from spacesim.learning.reflectance import past_earth
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import Scatterers, add_irradiance, add_irradiance_slopes, irradiance
 from spacesim.splat.light.config import LightConfig
@@ -44,13 +45,17 @@ class SunEncoding:
     field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
     refine_encoding: Float  #: input of the refinement's network
     beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
-    #: where the Earth hides some of the Sun, the share of it that is left: Float [2] in a list, of light and of colours
-    #: as they are blended; else nothing
-    eclipse: list[Float]
+    eclipse: list[Float]  #: where the Earth hides some of the Sun, Float [2] of `eclipse_numbers` in a list, or nothing
 
-    def left(self, values: list[Float], of: int = 0) -> list[Float]:
-        """What the Earth leaves of sunlight [M]: of light (0), or of colours (1)."""
-        return [v * dr.gather(ad.Float, share, ad.UInt32(of)) for v in values for share in self.eclipse] or values
+    def left(self, light: list[Float]) -> list[Float]:
+        """What the Earth leaves of sunlight [M]."""
+        return [value * dr.gather(ad.Float, left, ad.UInt32(0)) for left in self.eclipse for value in light] or light
+
+    def colors_left(self, colors: list[Float]) -> tuple[list[Float], list[Float]]:
+        """`past_earth` of colours [M], which are as they were where there is no eclipse."""
+        for numbers in self.eclipse:
+            return past_earth(colors, numbers)
+        return colors, [ad.Float(1) for _ in colors]
 
 
 @dataclass
@@ -162,10 +167,10 @@ def first_layer_of_features(
 def _dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
     """Colours [M] dimmed by the Earth and by visibility ([M] in a list, or nothing), then that as it is shown. faces:
     of `sun_facing`"""
-    colors = sun.left(colors, of=1)
     if not visibility:
-        return colors
-    return [color * visibility[0] for color in colors] + sun.left([_picture_visibility(visibility[0], faces)])
+        return sun.colors_left(colors)[0]
+    dimmed, _ = sun.colors_left([color * visibility[0] for color in colors])
+    return dimmed + sun.left([_picture_visibility(visibility[0], faces)])
 
 
 def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
@@ -204,12 +209,13 @@ def adjoint(
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]
     grad_albedo: list[Float] = []
     grad_earth: list[Float] = []
+    dimmed, slopes = inputs.sun.colors_left([color * visibility for color in tape.colors])
     if tape.scattered:
-        dimmed = [color * visibility for color in inputs.sun.left(tape.colors, of=1)]
         gradients, grad_albedo, grad_earth = _scattered_adjoint(
             config, inputs, gradients, dimmed, tape.scattered, batch
         )
-    pairs = list(zip(inputs.sun.left(gradients, of=1), tape.colors, strict=True))
+    gradients = [gradient * slope for gradient, slope in zip(gradients, slopes, strict=True)]
+    pairs = list(zip(gradients, tape.colors, strict=True))
     grad_output = batch.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     grad_weights, grad_items = mlp.backward(
         config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output

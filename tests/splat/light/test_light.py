@@ -224,10 +224,9 @@ def twin(
     own = embedding_of(light) if embedding is None else embedding
     shared = np.concatenate([encoded(field.sun, SUN[None])[0], own])
     color = sigmoid(network(field.shape, weights[:split], items, shared))
-    color = color * (left if config.linear else srgb_of(left))
     if not raw:
         visible = np.ones(len(color))
-        color, given = with_scattered(light, arrays, color, visible, given, earth)
+        color, given = with_scattered(light, arrays, eclipsed(light, color, left), visible, given, earth)
         return color, visible, given
     occlusion, alignment, thickness, bias = raw
     if config.refine:
@@ -246,8 +245,15 @@ def twin(
         output = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(output + (np.log(sure / (1 - sure)) if refine.residual else 0))
-    color, given = with_scattered(light, arrays, color * (1 - occlusion)[:, None], 1 - occlusion, given, earth)
+    color = eclipsed(light, color * (1 - occlusion)[:, None], left)
+    color, given = with_scattered(light, arrays, color, 1 - occlusion, given, earth)
     return color, left * (1 - occlusion) * faces, given
+
+
+def eclipsed(light: LightModel, color: np.ndarray, left: float) -> np.ndarray:
+    if left == 1 or light.config.linear:
+        return left * color
+    return np.maximum(left * color, left ** (1 / 2.4) * (color + 0.055) - 0.055)
 
 
 def earthlit(light: LightModel, arrays: dict, earth: Earth = EARTH) -> np.ndarray:

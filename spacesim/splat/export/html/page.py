@@ -32,7 +32,7 @@ def write_page(
     run: Run, path: Path, report: Callable[[int, int], None] | None = None, earth: Earth | None = None
 ) -> None:
     """Write `run` as a page. report: called with (steps done, of all);  earth: that any Sun lights, for a run that
-    `knows_earth`; where it is stays
+    `knows_earth`, and that can hide it; where it is stays
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -45,14 +45,14 @@ def write_page(
         raise InputError(
             f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
         )
-    about, arrays = _content(run, report, earth if run.knows_earth else None)
+    about, arrays = _content(run, report, earth if run.relightable else None)
     write_bytes(Path(path), _page(run, about, arrays).encode())
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth | None) -> tuple[JsonDict, Arrays]:
     """The data of the page, and its arrays."""
-    gaussians, light = run.gaussians, run.light
-    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light, earth) if light else 0)
+    gaussians, light, bright = run.gaussians, run.light, earth if run.knows_earth else None
+    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light, bright) if light else 0)
     done = 0
 
     def step() -> None:
@@ -62,7 +62,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth |
             report(done, steps)
 
     colors = tabulate_colors(gaussians, light, step)
-    sunlight = tabulate_sunlight(gaussians, light, step, earth) if light else None
+    sunlight = tabulate_sunlight(gaussians, light, step, bright) if light else None
     arrays = _shapes(gaussians) | {"colors": colors.coefficients, "color_table": colors.table}
     means = arrays["means"].astype(np.float64)
     centre = np.median(means, axis=0)

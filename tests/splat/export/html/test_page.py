@@ -31,7 +31,7 @@ from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import preset
 
 COUNT = 150
-EARTH = Earth([0.3, 0.2, -1.0], albedo=1.0)
+EARTH = Earth([0.3, 0.2, -1.0], 50.0, albedo=1.0)
 CLOSE = {"plain": 37, "relit": 29, "linear": 34, "directions": 30, "earthlit": 29}  #: dB at least
 
 
@@ -150,6 +150,24 @@ def test_the_earth_is_as_bright_as_in_render(runs, tabs):
     camera, sun = camera_at([0.2, -0.1, -4.0]), Sun.from_angles(30, 80)
     both, alone = (np.clip(runs["earthlit"].predict(camera, one).rgb, 0, 1) for one in (replace(sun, earth=EARTH), sun))
     assert psnr(alone, both) + 5 < psnr(drawn(tabs["earthlit"], camera, sun), both)
+
+
+def test_the_earth_hides_the_sun_as_in_render(runs, tabs):
+    camera, limb = camera_at([0.2, -0.1, 4.0]), np.radians(EARTH.angular_radius_deg)
+    side = np.cross(EARTH.direction, [0, 1, 0]) / np.linalg.norm(np.cross(EARTH.direction, [0, 1, 0]))
+    shares = []
+    for radii in (-2.0, -0.5, 0.3, 0.8):
+        angle = limb + radii * 0.00465
+        sun = Sun(np.cos(angle) * EARTH.direction + np.sin(angle) * side, EARTH)
+        shares.append(sun.visible_share)
+        for name, least in (
+            ("relit", CLOSE["relit"]),
+            ("earthlit", 25),
+        ):  # whose crescent ends between cells of a table
+            rendered = np.clip(runs[name].predict(camera, sun).rgb, 0, 1)
+            tabs[name].send("Page.bringToFront")
+            assert psnr(drawn(tabs[name], camera, sun), rendered) > least, (name, radii)
+    assert shares[0] == 0 < shares[1] < 0.3 < 0.6 < shares[2] < 0.8 < shares[3] < 1
 
 
 def test_a_large_splat_near_the_eye_is_cut_as_in_render(runs, tabs):
