@@ -16,7 +16,7 @@ from spacesim.viewer.drawing.paint import Bytes, add_color_bar
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.network.message_filter import has_pending_files
 from spacesim.viewer.panels.controls import ClientControls, SunControls
-from spacesim.viewer.panels.handles import FRUSTUM, add_frusta
+from spacesim.viewer.panels.handles import FRUSTUM, HANDLES, add_frusta
 from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.state import SharedScene, ViewerCamera, parse_viewer_camera
 from spacesim.viewer.truth.source import TruthService
@@ -49,6 +49,9 @@ class Client:
         self.handle, self._renderer, self._shared, self._loop, self._dataset = handle, renderer, shared, loop, dataset
         self._sun = sun
         self._frusta: list[viser.CameraFrustumHandle] = []
+        self._handles = handle.scene.add_frame(HANDLES, show_axes=False)
+        self._first: ViewerCamera | None = None  # as it was before it was widened; None once it has been left, too
+        self._first_fovs: list[float] = []
         self._lock = threading.Lock()
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
@@ -58,6 +61,7 @@ class Client:
     def begin(self) -> None:
         """Draw for it from now on."""
         self.handle.camera.on_update(self._moved)
+        self._first = _view_of(self.handle.camera)
         self._on_camera(self.handle.camera)
 
     def close(self) -> None:
@@ -105,6 +109,10 @@ class Client:
             size = FRUSTUM * self._renderer.bounds(self._shared.state)[1]
             self._frusta = add_frusta(self.handle.scene, self._dataset, size, self.jump_to_frame)
 
+    def show_handles(self, visible: bool) -> None:
+        """See `Actions`."""
+        self._handles.visible = visible
+
     def save_picture(self) -> None:
         """See `Actions`."""
         view, mode = self.session.view, self.session.settings.mode
@@ -141,10 +149,30 @@ class Client:
         self._on_camera(camera)
 
     def _on_camera(self, camera: "viser.CameraHandle") -> None:
-        pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
-        view = parse_viewer_camera(*pose)
+        view = _view_of(camera)
         if view is not None:
+            self._widen_first(view)
             self.session.on_camera_moved(view)
+
+    def _widen_first(self, view: ViewerCamera) -> None:
+        """Until it is moved, a window that is higher than wide, as beside a docked panel, shows the width of what a
+        square one does."""
+        first = self._first
+        if first is None:
+            return
+        known = any(np.isclose(view.fov, fov, rtol=1e-4) for fov in (first.fov, *self._first_fovs))
+        if not known or not np.allclose(view.world_from_camera, first.world_from_camera, atol=1e-5):
+            self._first = None
+            return
+        fov = float(2 * np.arctan(np.tan(0.5 * first.fov) * max(view.height / view.width, 1.0)))
+        if not np.isclose(view.fov, fov, rtol=1e-4):
+            self._first_fovs.append(fov)
+            self.handle.camera.fov = fov
+
+
+def _view_of(camera: "viser.CameraHandle") -> ViewerCamera | None:
+    pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
+    return parse_viewer_camera(*pose)
 
 
 def fov_to_hold(camera: Camera, aspect: float) -> float:

@@ -117,6 +117,9 @@ class Actions(Protocol):
     def show_frusta(self, visible: bool) -> None:
         """Show or hide the cameras of the data."""
 
+    def show_handles(self, visible: bool) -> None:
+        """Show or hide all that can be grabbed."""
+
     def save_picture(self) -> None:
         """Send a PNG of the view."""
 
@@ -159,6 +162,7 @@ class ClientControls:
         mode.on_update(_call(lambda: session.change_settings(mode=mode.value)))
         side.on_update(_call(lambda: session.change_settings(side=side.value)))
         compare.on_update(_call(lambda: session.change_settings(compare=compare.value)))
+        compare.on_update(_call(lambda: actions.show_handles(compare.value != "beside")))  # they fill the window
         wipe.on_update(_call(lambda: session.change_settings(wipe=wipe.value)))
         samples.on_update(_call(lambda: session.change_settings(samples=samples.value)))
         picture.on_click(_call(actions.save_picture))
