@@ -13,6 +13,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict
 from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.folder import run_name
 from spacesim.serve.protocol import OUTPUTS, Output
 
 if TYPE_CHECKING:
@@ -134,8 +135,8 @@ class PredictedRun:
             _log.warning("serve: %s has learned the Earth's light, which is left out: clients name a Sun", run.path)
         some = {"visibility": run.has_shadows, "object_id": bool(run.parts)}
         self.outputs = [name for name in PREDICTED if some.get(name, True)]
-        path = Path(run.path).resolve()
-        name = path.stem if path.suffix == ".toml" else path.parent.name if path.name == "run" else path.name
+        path = Path(run.path)
+        name = path.stem if path.suffix == ".toml" else run_name(path)
         self.names = (name, *(part.name for part in run.parts))
 
     @property

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from spacesim.data.geometry import quaternion_from_rotation
@@ -50,18 +51,19 @@ class Client:
         self._sun = sun
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._handles = handle.scene.add_frame(HANDLES, show_axes=False)
-        self._first: ViewerCamera | None = None  # as it was before it was widened; None once it has been left, too
-        self._first_fovs: list[float] = []
+        self._first_fovs: list[float] = []  # vertical fields of view of the first place, the server's first
+        self._first_place = np.zeros(3)
+        self._is_begun = False  # at the first place; before, browsers report another
         self._lock = threading.Lock()
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
         self.controls = ClientControls(handle.gui, self.session, self, facts, frames, renderer.modes)
 
-    def begin(self) -> None:
-        """Draw for it from now on."""
+    def begin(self, place: ArrayLike, fov: float) -> None:
+        """Draw for it from now on. place, fov: [3] metres and vertical, radians, where it looks from at first"""
+        self._first_place, self._first_fovs = np.array(place), [fov]
         self.handle.camera.on_update(self._moved)
-        self._first = _view_of(self.handle.camera)
         self._on_camera(self.handle.camera)
 
     def close(self) -> None:
@@ -149,7 +151,8 @@ class Client:
         self._on_camera(camera)
 
     def _on_camera(self, camera: "viser.CameraHandle") -> None:
-        view = _view_of(camera)
+        pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
+        view = parse_viewer_camera(*pose)
         if view is not None:
             self._widen_first(view)
             self.session.on_camera_moved(view)
@@ -157,22 +160,18 @@ class Client:
     def _widen_first(self, view: ViewerCamera) -> None:
         """Until it is moved, a window that is higher than wide, as beside a docked panel, shows the width of what a
         square one does."""
-        first = self._first
-        if first is None:
+        if not self._first_fovs:
             return
-        known = any(np.isclose(view.fov, fov, rtol=1e-4) for fov in (first.fov, *self._first_fovs))
-        if not known or not np.allclose(view.world_from_camera, first.world_from_camera, atol=1e-5):
-            self._first = None
+        is_there = np.allclose(view.world_from_camera[:3, 3], self._first_place, rtol=1e-4)
+        if not is_there or not np.isclose(view.fov, self._first_fovs, rtol=1e-4).any():
+            if self._is_begun:
+                self._first_fovs = []
             return
-        fov = float(2 * np.arctan(np.tan(0.5 * first.fov) * max(view.height / view.width, 1.0)))
+        self._is_begun = True
+        fov = float(2 * np.arctan(np.tan(0.5 * self._first_fovs[0]) * max(view.height / view.width, 1.0)))
         if not np.isclose(view.fov, fov, rtol=1e-4):
             self._first_fovs.append(fov)
             self.handle.camera.fov = fov
-
-
-def _view_of(camera: "viser.CameraHandle") -> ViewerCamera | None:
-    pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
-    return parse_viewer_camera(*pose)
 
 
 def fov_to_hold(camera: Camera, aspect: float) -> float:

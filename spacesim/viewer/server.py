@@ -158,7 +158,8 @@ class Viewer:
         client = Client(handle, setup.renderer, self.shared, self.loop, self._truth, setup.dataset, self._sun, facts)
         with self._lock:
             self.clients[handle.client_id] = client
-        client.begin()
+        first = self._server.initial_camera
+        client.begin(first.position, first.fov)
         _log.debug("viewer: client %d has come", handle.client_id)
 
     async def _on_disconnect(self, handle: "viser.ClientHandle") -> None:

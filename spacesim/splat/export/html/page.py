@@ -14,6 +14,7 @@ import numpy as np
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
+from spacesim.learning.folder import run_name
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
 from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
 from spacesim.splat.export.html.seen import tabulate_seen
@@ -29,10 +30,14 @@ Arrays = dict[str, np.ndarray]
 
 
 def write_page(
-    run: Run, path: Path, report: Callable[[int, int], None] | None = None, earth: Earth | None = None
+    run: Run,
+    path: Path,
+    report: Callable[[int, int], None] | None = None,
+    earth: Earth | None = None,
+    name: str | None = None,
 ) -> None:
     """Write `run` as a page. report: called with (steps done, of all);  earth: that any Sun lights, for a run that
-    `knows_earth`, and that can hide it; where it is stays
+    `knows_earth`, and that can hide it; where it is stays;  name: above the picture, by default the run's
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -46,7 +51,7 @@ def write_page(
             f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
         )
     about, arrays = _content(run, report, earth if run.relightable else None)
-    write_bytes(Path(path), _page(run, about, arrays).encode())
+    write_bytes(Path(path), _page(run, name or run_name(run.path), about, arrays).encode())
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth | None) -> tuple[JsonDict, Arrays]:
@@ -121,7 +126,7 @@ def _add_sunlight(sunlight: SunlightTables, about: JsonDict, arrays: Arrays) -> 
         arrays["bounce"], arrays["bounce_table"] = sunlight.bounce, sunlight.bounce_table
 
 
-def _page(run: Run, about: JsonDict, arrays: Arrays) -> str:
+def _page(run: Run, name: str, about: JsonDict, arrays: Arrays) -> str:
     """The whole file."""
     packed, start, described = [], 0, []
     for name, array in arrays.items():
@@ -130,7 +135,6 @@ def _page(run: Run, about: JsonDict, arrays: Arrays) -> str:
         content += bytes(-len(content) % 4)
         start += len(content)
         packed.append(content)
-    name = run.path.resolve().name
     caption = f"{run.config['method']}, {about['count']:,} Gaussians, made by spacesim"
     metadata = json.dumps(about | {"arrays": described}, sort_keys=True).replace("<", "\\u003c")
     parts = {
