@@ -127,6 +127,7 @@ class Client:
         place = world_from_camera[:3, 3]
         centre = self._renderer.bounds(self._shared.state)[0]
         ahead = max(float((centre - place) @ world_from_camera[:3, 2]), 1e-3)
+        self._first_fovs = []
         with self.handle.atomic():
             camera.position = tuple(place)
             camera.look_at = tuple(place + ahead * world_from_camera[:3, 2])

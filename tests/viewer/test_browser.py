@@ -124,11 +124,10 @@ def test_a_narrow_window_shows_the_whole_width_at_first(viewer, browser):
         )
 
     wait_for(widened, "a wider view")
-    with client.handle.atomic():  # whoever moves has the view as he likes it
-        client.handle.camera.position = tuple(np.array(first.position) * 1.2)
-        client.handle.camera.fov = first.fov
-    wait_for(lambda: np.isclose(client.session.view.fov, first.fov), "the view that was chosen")
-    assert not client._first_fovs
+    client.look_from(client.session.view.world_from_camera, first.fov)  # whoever moves has the view that was chosen
+    wait_for(lambda: np.isclose(client.session.view.fov, first.fov), "that view")
+    client.handle.camera.fov = 0.9 * first.fov
+    wait_for(lambda: np.isclose(client.session.view.fov, 0.9 * first.fov), "another one")
 
 
 def test_a_dragged_gizmo_moves_its_model(viewer, tab, at_start):

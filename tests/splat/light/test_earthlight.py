@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from spacesim.cli.printing import NO_EARTH
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json
 from spacesim.data.images import linear_from_srgb, read_png
@@ -16,7 +17,7 @@ from spacesim.learning.lights import added_light
 from spacesim.scenes import Renderer, build, generate, read_scene
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
-from spacesim.serve.draw import PredictedRun
+from spacesim.serve.draw import load_served
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.compose.plain import bake_scene
 from spacesim.splat.compose.pose import Pose
@@ -284,8 +285,29 @@ def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, request, model, earthlit
     assert read_png(picture)[..., :3].max() == 0
 
 
-def test_a_served_run_says_that_it_is_left_out(run, caplog):
-    PredictedRun(run)
+def test_a_served_run_has_the_earth_of_its_data_or_scene(run, shadowed, earthlit, tmp_path, caplog):
+    frame = earthlit.test[0]
+    elsewhere = replace(frame.sun, earth=Earth(np.array([0.0, 1, 0.3]), 40.0))
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[[models]]\nrun = "{run.path}"\n[earth]\ndirection = [0, 1, 0.3]\nangular_radius_deg = 40\n'
+        "[sun]\nazimuth_deg = 0\nelevation_deg = 0\n"
+    )
+    for what, sun in ((run.path, frame.sun), (scene, elsewhere), (shadowed.path, beside_the_limb(frame, -2.0))):
+        served = load_served(what)
+        (seen,) = served.draw(frame.camera, Sun(sun.direction), None, ("rgb",), 0).values()
+        np.testing.assert_allclose(seen / 255, np.clip(served.run.predict(frame.camera, sun).rgb, 0, 1), atol=1 / 255)
+    assert seen.max() == 0
+    assert "left out" not in caplog.text
+
+
+def test_a_served_run_says_that_it_is_left_out(run, earthlit, caplog):
+    moved = replace(earthlit.train[0].sun, earth=Earth(np.array([0.0, 1, 0])))
+    several = replace(earthlit, root=run.path, train=(replace(earthlit.train[0], sun=moved), *earthlit.train[1:]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spacesim.data.store.read_dataset", lambda _: several)
+        served = load_served(run.path)
+    assert served.earth is None
     assert f"{run.path} has learned the Earth's light, which is left out" in caplog.text
 
 

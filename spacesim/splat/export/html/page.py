@@ -129,9 +129,9 @@ def _add_sunlight(sunlight: SunlightTables, about: JsonDict, arrays: Arrays) -> 
 def _page(run: Run, name: str, about: JsonDict, arrays: Arrays) -> str:
     """The whole file."""
     packed, start, described = [], 0, []
-    for name, array in arrays.items():
+    for array_name, array in arrays.items():
         content = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"))).tobytes()
-        described.append({"name": name, "type": array.dtype.name, "start": start, "length": array.size})
+        described.append({"name": array_name, "type": array.dtype.name, "start": start, "length": array.size})
         content += bytes(-len(content) % 4)
         start += len(content)
         packed.append(content)
