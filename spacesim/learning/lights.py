@@ -49,7 +49,8 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
     say, degrees. What they do not name is as the frame has it (`of_frame`); sun="none" asks for the Earth's light under
     the frame's Sun;  earth: see `named_earth`
 
-    Raises InputError where a relightable run gets no Sun, and for the Earth of a run that has not learned its light.
+    Raises InputError where a relightable run gets no Sun, for the Earth's light of a run that has not learned it, and as
+    `named_earth` does.
     """
     light: Light = "earth" if sun == "none" else "all"
     found = of_frame if sun is None or sun == "none" else Sun.from_angles(*sun)
@@ -67,10 +68,14 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
 
 def named_earth(run: CanPredict, earth: Named, of_frame: Earth | None = None) -> Earth | None:
     """The Earth in a direction, as large and bright as the frame's, else as `Earth` has it; the frame's where none is
-    named. Raises InputError for one that is named for a run that has not learned its light."""
+    named. Raises InputError for one that is named for a run that no Sun relights; of one that has not learned its light
+    a sentence says so."""
     if earth is None or earth == "none":
         return of_frame if earth is None else None
-    _check_knows_earth(run, "earth")
+    if not run.relightable:
+        raise InputError(f"earth: expected a run that the Sun relights, found {run.path}")
+    if not run.knows_earth:
+        log.warning("%s: has not learned the Earth's light (light.earth); it can but hide the Sun", run.path)
     towards = direction_from_angles(*earth)
     return replace(of_frame, direction=towards) if of_frame else Earth(towards)
 

@@ -205,6 +205,17 @@ def test_what_is_seen_of_the_sun_in_a_scene_without_own_shadows(run, shadowed, e
     assert seen.visibility[seen.alpha > 0.9] == pytest.approx(dim.visible_share, abs=1e-3)
 
 
+def test_render_hides_the_sun_behind_a_named_earth(spacesim, run, shadowed, tmp_path):
+    """A sentence says where that is all that it does."""
+    for model in (run, shadowed):
+        done = spacesim(
+            "render", model.path, "--frame", 16, "--sun", "10,-60", "--earth", "0,-80", "--out", tmp_path / "a.png"
+        )
+        assert done.code == 0, done.errors
+        assert read_png(tmp_path / "a.png")[..., :3].max() == 0
+        assert any("has not learned the Earth's light" in line for line in done.errors) == (model is shadowed)
+
+
 def test_a_model_of_one_light_has_no_eclipse(earthlit, tmp_path):
     run = train(earthlit, tmp_path / "run", replace(preset("demo", "vanilla"), iterations=1, init_count=300))
     frame = earthlit.test[0]
@@ -318,11 +329,11 @@ def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
     with pytest.raises(InputError, match=r"expected earth_direction in every training frame .*, found none in images/"):
         train(small_lit_dataset, tmp_path / "run", needed)
     blind = train(small_lit_dataset, tmp_path / "blind", replace(CONFIG, iterations=1))
-    for option in (("--earth", "0,0"), ("--sun", "none")):
-        done = spacesim("render", blind.path, *option, "--out", tmp_path / "a.png")
-        assert done.is_refusal(option[0], "light.earth", blind.path)
-    refused = spacesim("export", blind.path, "--ply", tmp_path / "a.ply", "--sun", "0,0", "--earth", "0,0")
-    assert refused.is_refusal("--earth", "light.earth", blind.path)
+    done = spacesim("render", blind.path, "--sun", "none", "--out", tmp_path / "a.png")
+    assert done.is_refusal("--sun", "light.earth", blind.path)
+    plain = train(small_lit_dataset, tmp_path / "plain", replace(preset("demo", "vanilla"), iterations=1))
+    refused = spacesim("render", plain.path, "--earth", "0,0", "--out", tmp_path / "a.png")
+    assert refused.is_refusal("--earth", "expected a run that the Sun relights", plain.path)
     refused = spacesim("export", blind.path, "--mesh", tmp_path / "a.ply", "--earth", "0,0")
     assert refused.is_refusal("--earth", "expected with --sun, --html, found without one")
     frame = small_lit_dataset.test[0]
