@@ -49,8 +49,7 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
     say, degrees. What they do not name is as the frame has it (`of_frame`); sun="none" asks for the Earth's light under
     the frame's Sun;  earth: see `named_earth`
 
-    Raises InputError where a relightable run gets no Sun, for the Earth's light of a run that has not learned it, and as
-    `named_earth` does.
+    Raises InputError where a relightable run gets no Sun, for the Earth's light of a run without, and as `named_earth`.
     """
     light: Light = "earth" if sun == "none" else "all"
     found = of_frame if sun is None or sun == "none" else Sun.from_angles(*sun)
