@@ -60,7 +60,7 @@ def demo(out: Path, reporting: Callable[[str, str], AbstractContextManager[Repor
     page = out / "run" / PAGE
     if not page.exists():
         with reporting("export", "steps") as report:
-            write_page(run, page, report)
+            write_page(run, page, report, name=SCENE)
     finished("page")
     with reporting("evaluate", "frames") as report:
         metrics = evaluate(run, dataset, out / "eval", EvaluateConfig(), report)

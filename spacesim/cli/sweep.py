@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
     camera, of_frame = view_of(options, run)
-    if of_frame is not None and run.knows_earth:
+    if of_frame is not None:
         suns = [replace(sun, earth=of_frame.earth) for sun in suns]
     if options.size is not None:
         camera = resize_camera(camera, options.size)

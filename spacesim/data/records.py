@@ -185,6 +185,11 @@ class Sun:
         return angles_from_direction(self.direction)
 
     @property
+    def visible_share(self) -> float:
+        """Of its disc, past the Earth that it names, see `Earth.visible_sun`."""
+        return 1.0 if self.earth is None else self.earth.visible_sun(self.direction)
+
+    @property
     def is_hidden(self) -> bool:
         """Whether its centre is behind the Earth that it names: less than half of its disc gives light."""
         earth = self.earth

@@ -156,6 +156,12 @@ def device() -> str:
     return f"{platform.machine()} CPU, {os.cpu_count()} cores"
 
 
+def run_name(path: Path) -> str:
+    """What a run is called: its folder, or the one above a "run"."""
+    folder = path.resolve()
+    return folder.parent.name if folder.name == "run" else folder.name
+
+
 def describe_data(dataset: Dataset) -> JsonDict:
     """What a run remembers of its data: enough to find it again and to notice another one in its place."""
     return {

@@ -1,5 +1,6 @@
 """Which sources light a picture, as commands and scripts name them: the Sun, the Earth that it lights, or both."""
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol, get_args
@@ -10,8 +11,10 @@ from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images.tone import display_values, linear_from_display
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.learning.prediction import MaterialView, Prediction
+
+log = logging.getLogger(__name__)
 
 Light = Literal["all", "sun", "earth"]  #: of both sources, or of one alone
 Named = tuple[float, float] | Literal["none"] | None  #: azimuth and elevation, degrees; "none"; or nothing is said
@@ -46,7 +49,7 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
     say, degrees. What they do not name is as the frame has it (`of_frame`); sun="none" asks for the Earth's light under
     the frame's Sun;  earth: see `named_earth`
 
-    Raises InputError where a relightable run gets no Sun, and for the Earth of a run that has not learned its light.
+    Raises InputError where a relightable run gets no Sun, for the Earth's light of a run without, and as `named_earth`.
     """
     light: Light = "earth" if sun == "none" else "all"
     found = of_frame if sun is None or sun == "none" else Sun.from_angles(*sun)
@@ -64,10 +67,14 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
 
 def named_earth(run: CanPredict, earth: Named, of_frame: Earth | None = None) -> Earth | None:
     """The Earth in a direction, as large and bright as the frame's, else as `Earth` has it; the frame's where none is
-    named. Raises InputError for one that is named for a run that has not learned its light."""
+    named. Raises InputError for one that is named for a run that no Sun relights; of one that has not learned its light
+    a sentence says so."""
     if earth is None or earth == "none":
         return of_frame if earth is None else None
-    _check_knows_earth(run, "earth")
+    if not run.relightable:
+        raise InputError(f"earth: expected a run that the Sun relights, found {run.path}")
+    if not run.knows_earth:
+        log.warning("%s: has not learned the Earth's light (light.earth); it can but hide the Sun", run.path)
     towards = direction_from_angles(*earth)
     return replace(of_frame, direction=towards) if of_frame else Earth(towards)
 
@@ -92,11 +99,26 @@ def predict_light(
     exposure: float | None = None,
 ) -> Prediction:
     """As `run.predict`, in the light of both sources or of one alone."""
-    without = sun and replace(sun, earth=None)
+    without = sun
+    if sun is not None and sun.earth is not None:
+        without = replace(sun, earth=replace(sun.earth, albedo=0.0))  # which hides the Sun as it does
     if light == "sun":
         return run.predict(camera, without, normals, exposure)
     seen = run.predict(camera, sun, normals, exposure)
     return added_light(seen, run.predict(camera, without, exposure=exposure)) if light == "earth" else seen
+
+
+def sunlit_frames(dataset: Dataset) -> list[int]:
+    """Which training frames a method that takes the Sun trains on: not those whose Sun the Earth hides; a sentence says
+    how many. Raises InputError where it hides every one."""
+    frames = dataset.train
+    sunlit = [number for number, frame in enumerate(frames) if frame.sun is None or not frame.sun.is_hidden]
+    if not sunlit:
+        raise InputError(f"{dataset.root}: expected a training frame whose Sun the Earth does not hide, found none")
+    if len(sunlit) < len(frames):
+        dark = len(frames) - len(sunlit)
+        log.warning("%d of %d training frames are left out: the Earth hides their Sun", dark, len(frames))
+    return sunlit
 
 
 def added_light(prediction: Prediction, to: Prediction) -> Prediction:

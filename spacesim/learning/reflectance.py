@@ -1,11 +1,14 @@
-"""What the look of a surface depends on: cosines between its normal, the Sun and the view."""
+"""What the look of a surface depends on: cosines between its normal, the Sun and the view, and how much of the Sun the
+Earth leaves."""
 
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.data.geometry import Array
 
 LOBES = (8, 32, 128, 512)  #: exponents of n . h, from satin to mirror: each is the one before to the fourth
 COSINES = 4 + len(LOBES)  #: numbers that `surface_cosines` gives
@@ -46,3 +49,22 @@ def seen_side_normals(normals: Array3f, direction: Array3f) -> Any:
 def points_away(normals: Array3f, direction: Array3f) -> Bool:
     """Bool [M]: is the side seen to which the normal does not point? direction: from the camera"""
     return dr.detach(dr.dot(normals, direction)) > 0
+
+
+def eclipse_numbers(share: float, linear: bool) -> Array:
+    """[2]: what `past_earth` reads. share: of the Sun that the Earth leaves;  linear: of colours, else sRGB values"""
+    return np.array([share, 0.0 if linear or share == 1 else share ** (1 / 2.4)])
+
+
+def past_earth(colors: list[Float], numbers: Float, at: int = 0) -> tuple[list[Float], list[Float]]:
+    """(colours in the share of sunlight that the Earth leaves, their slopes by the colours). numbers: has
+    `eclipse_numbers` from place `at` on
+
+    Of sRGB values c it is encode(f decode(c)), which is f^(1 / 2.4) (c + 0.055) - 0.055 but near black, where it is f c
+    (IEC 61966-2-1); the larger of both is within 0.011 of it, and f c of linear colours.
+    """
+    share, power = (dr.gather(ad.Float, numbers, ad.UInt32(at + i)) for i in range(2))
+    bright = [power * (color + 0.055) - 0.055 for color in colors]
+    pairs = list(zip(colors, bright, strict=True))
+    seen = [dr.maximum(share * color, other) for color, other in pairs]
+    return seen, [dr.select(share * color < other, power, share) for color, other in pairs]

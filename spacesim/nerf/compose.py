@@ -27,7 +27,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, may_shade
 from spacesim.data.records import Camera, Sun
-from spacesim.nerf.draw import RaySamples, check_chunk, chunks, shown, unit_normals
+from spacesim.nerf.draw import RaySamples, check_chunk, chunks, shown, sun_numbers, unit_normals
 from spacesim.nerf.partition import DeviceSunOccluder, MutualShading, PlacedField, PlacedFields, model_rays, partition
 from spacesim.nerf.run import NerfRun
 from spacesim.nerf.sampling.box import SceneBox
@@ -221,7 +221,7 @@ def _place(model: Placed, camera: Camera, sun: Sun | None) -> PlacedField:
     run, pose = model.run, model.pose
     towards = None
     if run.relightable and sun is not None:
-        towards = upload(pose.direction_in_model(sun.direction))
+        towards = sun_numbers(pose.direction_in_model(sun.direction), sun)
     turn: Array = np.asarray(pose.rotation, np.float64)
     return PlacedField(
         upload(camera_rows([pose.camera_in_model(camera)], run.box)),

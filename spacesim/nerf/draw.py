@@ -10,7 +10,9 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload
-from spacesim.data.records import Camera
+from spacesim.data.geometry import Array
+from spacesim.data.records import Camera, Sun
+from spacesim.learning.reflectance import eclipse_numbers, past_earth
 from spacesim.nerf.config import CHUNK, NerfConfig
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
@@ -49,7 +51,7 @@ def sample_field(
 ) -> RaySamples:
     """Intervals of the field's own samples of `count` rays, and what it has there.
 
-    filled: see `Occupancy.filled`;  extent: Float [3], of the box;  sun: Float [3], towards it
+    filled: see `Occupancy.filled`;  extent: Float [3], of the box;  sun: Float [5] of `sun_numbers`
     """
     samples, towards = networks.config.samples, _towards(sun)
     edges, _ = networks.sample(parameters, rays, count, None)
@@ -58,13 +60,15 @@ def sample_field(
     own = networks.of_round(parameters, 2)
     low, high = t - 0.5 * lengths, t + 0.5 * lengths
     density, color, _ = networks.field.look_up(own, point, direction, towards)
-    if not networks.config.casts_shadows:
+    if sun is None or towards is None:
         return RaySamples(low, high, density, color)
-    assert towards is not None, "a field that takes the Sun"
+    if not networks.config.casts_shadows:
+        return RaySamples(low, high, density, past_earth(color, sun, at=3)[0])
     made = volume_weights(density * lengths, samples)
     seen = ray_visibility(networks, parameters, filled, extent, rays, made, low, high, towards)
     visibility = spread(seen, samples)
-    return RaySamples(low, high, density, mix(color, visibility), visibility)
+    dimmed, _ = past_earth(mix(color, visibility), sun, at=3)
+    return RaySamples(low, high, density, dimmed, visibility * dr.gather(ad.Float, sun, ad.UInt32(3)))
 
 
 def draw_rays(
@@ -136,18 +140,18 @@ def draw(
     filled: Float,
     box: SceneBox,
     camera: Camera,
-    sun: np.ndarray | None,
+    sun: Sun | None,
     normals: bool,
 ) -> dict[str, np.ndarray]:
     """Planes of a picture by name, [H, W] or [H, W, 3] float32, depths in metres. Memory on the device is that of a
-    chunk of rays: raises MemoryError where these do not fit. sun: [3] towards it, of a field that takes it"""
+    chunk of rays: raises MemoryError where these do not fit. sun: of a field that takes it"""
     check_chunk([networks.config], networks.config.chunk)
     left_out = {"normal": not normals, "visibility": not networks.config.casts_shadows}
     names = [name for name in PLANES if not left_out.get(name)]
     size, chunk = camera.width * camera.height, networks.config.chunk
     cameras, extent = upload(camera_rows([camera], box)), upload(box.extent)
     width = dr.opaque(ad.UInt32, camera.width)
-    towards = None if sun is None else upload(sun)
+    towards = None if sun is None else sun_numbers(sun.direction, sun)
     crossing = np.concatenate(
         [
             np.array(_find_crossing(networks, filled, cameras, dr.opaque(ad.UInt32, first), width, extent), bool)
@@ -212,6 +216,11 @@ def _rays(cameras: Float, pixel: UInt32, width: UInt32, extent: Float) -> Rays:
     across = dr.maximum(width, 1)
     x, y = ad.Float(pixel % across) + 0.5, ad.Float(pixel // across) + 0.5
     return pixel_rays(cameras, dr.zeros(ad.UInt32, dr.width(pixel)), x, y, extent)
+
+
+def sun_numbers(towards: Array, sun: Sun) -> Float:
+    """[5]: the direction `towards` a Sun in the field's axes, then `eclipse_numbers`."""
+    return upload(np.concatenate([towards, eclipse_numbers(sun.visible_share, linear=False)]))
 
 
 def _towards(sun: Float | None) -> Array3f | None:

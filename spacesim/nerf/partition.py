@@ -88,7 +88,7 @@ class PlacedField:
     extent: Float  #: [3] of its box
     unit: Float  #: of width 1, metres of the world for a side of its box
     turn: Float  #: [9] world_from_model, rotation by rows
-    sun: Float | None  #: [3] towards it in the model's axes; None: the field does not take it
+    sun: Float | None  #: [5] of `sun_numbers` in the model's axes; None: the field does not take it
 
 
 class DeviceSunOccluder(Protocol):

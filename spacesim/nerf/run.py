@@ -126,8 +126,8 @@ class NerfRun:
 
     def _draw(self, camera: Camera, sun: Sun | None, normals: bool) -> dict[str, np.ndarray]:
         check_picture(camera)
-        towards = sun.direction if sun is not None and self.relightable else None
-        return draw(self.networks, self.parameters, self.filled, self.box, camera, towards, normals)
+        known = sun if self.relightable else None
+        return draw(self.networks, self.parameters, self.filled, self.box, camera, known, normals)
 
     def _check(self, sun: Sun | None, exposure: float | None) -> None:
         checked_sun(sun, self.relightable, f"a run of {self.config['method']}")

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -9,10 +10,12 @@ import numpy as np
 
 from spacesim import interrupts
 from spacesim.data import toml
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict
 from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
 from spacesim.data.records import Camera, Sun
+from spacesim.learning.folder import run_name
 from spacesim.serve.protocol import OUTPUTS, Output
 
 if TYPE_CHECKING:
@@ -108,8 +111,6 @@ class TracedScene:
         self, radiance: np.ndarray, alpha: np.ndarray, camera: Camera, sun: Sun, exposure: float | None, seed: int
     ) -> np.ndarray:
         """[H, W, 3] uint8: as `generate` records it, over black where that has alpha."""
-        from dataclasses import replace
-
         from spacesim.scenes.cameras.exposure import record_image
 
         config = self._config.camera
@@ -126,16 +127,17 @@ class TracedScene:
 
 
 class PredictedRun:
-    """A run of any method, or a composed scene: a `Predictor`."""
+    """A run of any method, or a composed scene: a `Predictor`. earth: that the Suns of clients light, or hide behind"""
 
-    def __init__(self, run: "Predictor") -> None:
-        self.run = run
-        if run.knows_earth:
-            _log.warning("serve: %s has learned the Earth's light, which is left out: clients name a Sun", run.path)
+    def __init__(self, run: "Predictor", earth: Earth | None = None) -> None:
+        self.run, self.earth = run, earth
+        if run.knows_earth and earth is None:
+            why = "neither all of its data nor a scene name one and the same"
+            _log.warning("serve: %s has learned the Earth's light, which is left out: %s", run.path, why)
         some = {"visibility": run.has_shadows, "object_id": bool(run.parts)}
         self.outputs = [name for name in PREDICTED if some.get(name, True)]
-        path = Path(run.path).resolve()
-        name = path.stem if path.suffix == ".toml" else path.parent.name if path.name == "run" else path.name
+        path = Path(run.path)
+        name = path.stem if path.suffix == ".toml" else run_name(path)
         self.names = (name, *(part.name for part in run.parts))
 
     @property
@@ -152,7 +154,8 @@ class PredictedRun:
             if name not in self.outputs:
                 expected = f"some of {', '.join(self.outputs)} of {self.names[0]}"
                 raise InputError(f"outputs: expected {expected}, found {name}")
-        seen = self.run.predict(camera, sun, normals="normal" in outputs, exposure=exposure)
+        lit = None if sun is None else replace(sun, earth=self.earth)
+        seen = self.run.predict(camera, lit, normals="normal" in outputs, exposure=exposure)
         arrays: dict[str, Any] = {"alpha": seen.alpha, "depth": seen.depth, "normal": seen.normal}
         arrays |= {"rgb": as_bytes(seen.rgb), "visibility": seen.visibility, "object_id": getattr(seen, "id", None)}
         return {name: arrays[name] for name in outputs}
@@ -162,7 +165,7 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
     """What draws a scene (a built-in name, a scene file, a mesh file), a run (a folder) or a composed scene (a TOML
     file with models). spp: samples a pixel of a scene. Raises InputError where there is none of these, and for samples
     of a run."""
-    from spacesim.methods import load_predictor
+    from spacesim.methods import load_run, load_scene
     from spacesim.scenes import BUILT_IN_SCENES, read_scene
 
     path = Path(what)
@@ -170,7 +173,23 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
     if is_composed or (path.is_dir() and str(what) not in BUILT_IN_SCENES):
         if spp is not None:
             raise InputError(f"spp: expected with a scene, found {spp} with {what}, which is not path-traced")
-        return PredictedRun(load_predictor(path))
+        if not is_composed:
+            run = load_run(path)
+            return PredictedRun(run, _earth_of(Path(run.config["data"]["path"])))
+        from spacesim.splat.compose import ComposedRun
+
+        scene = load_scene(path)
+        return PredictedRun(ComposedRun(scene.posed_at(0.0), path), scene.earth)
     if spp is not None and not 1 <= spp <= 1_000_000:
         raise InputError(f"spp: expected 1 to 1,000,000, found {spp}")
     return TracedScene(read_scene(what), spp)
+
+
+def _earth_of(data: Path) -> Earth | None:
+    """The one that all frames of the dataset of a run name; None where that is gone, or they name none or several."""
+    from spacesim.data.store import read_dataset
+
+    if not (data / "transforms.json").is_file():
+        return None
+    earths = {frame.sun.earth if frame.sun else None for frame in read_dataset(data).frames}
+    return earths.pop() if len(earths) == 1 else None

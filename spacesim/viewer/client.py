@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from spacesim.data.geometry import quaternion_from_rotation
@@ -16,7 +17,7 @@ from spacesim.viewer.drawing.paint import Bytes, add_color_bar
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.network.message_filter import has_pending_files
 from spacesim.viewer.panels.controls import ClientControls, SunControls
-from spacesim.viewer.panels.handles import FRUSTUM, add_frusta
+from spacesim.viewer.panels.handles import FRUSTUM, HANDLES, add_frusta
 from spacesim.viewer.session import Session, Statistics
 from spacesim.viewer.state import SharedScene, ViewerCamera, parse_viewer_camera
 from spacesim.viewer.truth.source import TruthService
@@ -49,14 +50,19 @@ class Client:
         self.handle, self._renderer, self._shared, self._loop, self._dataset = handle, renderer, shared, loop, dataset
         self._sun = sun
         self._frusta: list[viser.CameraFrustumHandle] = []
+        self._handles = handle.scene.add_frame(HANDLES, show_axes=False)
+        self._first_fovs: list[float] = []  # vertical fields of view of the first place, the server's first
+        self._first_place = np.zeros(3)
+        self._is_begun = False  # at the first place; before, browsers report another
         self._lock = threading.Lock()
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
         self.controls = ClientControls(handle.gui, self.session, self, facts, frames, renderer.modes)
 
-    def begin(self) -> None:
-        """Draw for it from now on."""
+    def begin(self, place: ArrayLike, fov: float) -> None:
+        """Draw for it from now on. place, fov: [3] metres and vertical, radians, where it looks from at first"""
+        self._first_place, self._first_fovs = np.array(place), [fov]
         self.handle.camera.on_update(self._moved)
         self._on_camera(self.handle.camera)
 
@@ -105,6 +111,10 @@ class Client:
             size = FRUSTUM * self._renderer.bounds(self._shared.state)[1]
             self._frusta = add_frusta(self.handle.scene, self._dataset, size, self.jump_to_frame)
 
+    def show_handles(self, visible: bool) -> None:
+        """See `Actions`."""
+        self._handles.visible = visible
+
     def save_picture(self) -> None:
         """See `Actions`."""
         view, mode = self.session.view, self.session.settings.mode
@@ -117,6 +127,7 @@ class Client:
         place = world_from_camera[:3, 3]
         centre = self._renderer.bounds(self._shared.state)[0]
         ahead = max(float((centre - place) @ world_from_camera[:3, 2]), 1e-3)
+        self._first_fovs = []
         with self.handle.atomic():
             camera.position = tuple(place)
             camera.look_at = tuple(place + ahead * world_from_camera[:3, 2])
@@ -144,7 +155,24 @@ class Client:
         pose = camera.wxyz, camera.position, camera.fov, camera.image_width, camera.image_height
         view = parse_viewer_camera(*pose)
         if view is not None:
+            self._widen_first(view)
             self.session.on_camera_moved(view)
+
+    def _widen_first(self, view: ViewerCamera) -> None:
+        """Until it is moved, a window that is higher than wide, as beside a docked panel, shows the width of what a
+        square one does."""
+        if not self._first_fovs:
+            return
+        is_there = np.allclose(view.world_from_camera[:3, 3], self._first_place, rtol=1e-4)
+        if not is_there or not np.isclose(view.fov, self._first_fovs, rtol=1e-4).any():
+            if self._is_begun:
+                self._first_fovs = []
+            return
+        self._is_begun = True
+        fov = float(2 * np.arctan(np.tan(0.5 * self._first_fovs[0]) * max(view.height / view.width, 1.0)))
+        if not np.isclose(view.fov, fov, rtol=1e-4):
+            self._first_fovs.append(fov)
+            self.handle.camera.fov = fov
 
 
 def fov_to_hold(camera: Camera, aspect: float) -> float:

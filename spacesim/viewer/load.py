@@ -6,6 +6,7 @@ from pathlib import Path
 from spacesim.data.errors import InputError
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import read_dataset
+from spacesim.learning.folder import run_name
 from spacesim.methods import compose, load_run, load_scene
 from spacesim.splat.compose import PlacedRun
 from spacesim.splat.compose.posed_scene import PosedScene
@@ -55,9 +56,7 @@ def _scene(path: Path) -> PosedScene:
     if not path.exists():
         raise InputError(f"{path}: expected the folder of a run or a scene file (.toml), found nothing")
     run = load_run(path)
-    folder = path.resolve()
-    name = folder.parent.name if folder.name == "run" else folder.name
-    return PosedScene(compose([PlacedRun(run, name=name)]))  # type: ignore[arg-type]
+    return PosedScene(compose([PlacedRun(run, name=run_name(path))]))  # type: ignore[arg-type]
 
 
 def _initial_sun(dataset: Dataset | None) -> Sun:

@@ -103,7 +103,7 @@ class Viewer:
         self._sun: SunControls | None = None
         handle = None
         if setup.renderer.relightable and setup.state.sun is not None:
-            self._sun = SunControls(server.gui, self.shared, setup.renderer.knows_earth)
+            self._sun = SunControls(server.gui, self.shared)
             handle = SunHandle(server.scene, setup.renderer, self.shared, self._sun.drag)
         self._models = ModelControls(server.gui, setup.renderer, self.shared, gizmos, handle)
         self.paths = PathControls(server.gui, setup.renderer, self.shared, self._client, self.set_state, setup.path)
@@ -158,7 +158,8 @@ class Viewer:
         client = Client(handle, setup.renderer, self.shared, self.loop, self._truth, setup.dataset, self._sun, facts)
         with self._lock:
             self.clients[handle.client_id] = client
-        client.begin()
+        first = self._server.initial_camera
+        client.begin(first.position, first.fov)
         _log.debug("viewer: client %d has come", handle.client_id)
 
     async def _on_disconnect(self, handle: "viser.ClientHandle") -> None:

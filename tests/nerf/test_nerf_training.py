@@ -12,8 +12,9 @@ from small_field import CONFIG, GRID
 
 import spacesim as ss
 from spacesim import methods
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
-from spacesim.data.images import load_image, read_png
+from spacesim.data.images import linear_from_srgb, load_image, read_png
 from spacesim.learning.tensors import read_tensors, write_tensors
 from spacesim.methods import load_predictor
 from spacesim.nerf.config import NerfConfig, preset, with_settings
@@ -251,6 +252,27 @@ def _turned(camera):
     return replace(camera, world_from_camera=pose)
 
 
+def limb_before(sun) -> Earth:
+    """An Earth that leaves a part of the Sun."""
+    earth = Earth(sun.direction + np.array([0, 0, 1.0]))
+    return replace(earth, angular_radius_deg=np.degrees(np.arccos(earth.direction @ sun.direction)) + 0.05)
+
+
+def test_frames_whose_sun_the_earth_hides_are_left_out(dataset, caplog):
+    """Of a field that takes the Sun."""
+    first, *others = dataset.train
+    night = replace(first, sun=replace(first.sun, earth=Earth(first.sun.direction)))
+    box, darker = scene_box(dataset, CONFIG.margin), replace(dataset, train=(night, *others))
+    lit = training_pixels(replace(dataset, train=tuple(others)), box, suns=True)
+    used = training_pixels(darker, box, suns=True)
+    assert f"1 of {len(dataset.train)} training frames are left out: the Earth hides their Sun" in caplog.text
+    for name in ("color", "view", "cameras", "suns"):
+        np.testing.assert_array_equal(np.array(getattr(used, name)), np.array(getattr(lit, name)))
+    assert len(training_pixels(darker, box, suns=False).color) > len(used.color)
+    with pytest.raises(InputError, match="expected a training frame whose Sun the Earth does not hide, found none"):
+        training_pixels(replace(dataset, train=(night,)), box, suns=True)
+
+
 def test_a_field_that_takes_the_sun_as_input(dataset, tmp_path):
     run = ss.train(dataset, tmp_path / "run", replace(CONFIG, method="nerf-relight", iterations=60))
     assert isinstance(run, NerfRun)
@@ -265,6 +287,15 @@ def test_a_field_that_takes_the_sun_as_input(dataset, tmp_path):
     composed = methods.compose([PlacedRun(run)], ComposeConfig(), None).predict(camera, ss.Sun.from_angles(40, 25))
     np.testing.assert_allclose(composed.visibility, one.visibility, atol=2e-3)
     np.testing.assert_allclose(composed.rgb, one.rgb, atol=2e-3)
+    half = ss.Sun(one.sun.direction, limb_before(one.sun))
+    dim, composed = run.predict(camera, half), methods.compose([PlacedRun(run)], ComposeConfig(), None)
+    np.testing.assert_allclose(dim.visibility, half.visible_share * one.visibility, atol=1e-5)
+    light = [linear_from_srgb(view.rgb).sum() for view in (dim, one)]
+    assert light[0] / light[1] == pytest.approx(half.visible_share, abs=0.08)  # of a thin fog, blended as sRGB values
+    np.testing.assert_allclose(composed.predict(camera, half).visibility, dim.visibility, atol=2e-3)
+    np.testing.assert_allclose(composed.predict(camera, half).rgb, dim.rgb, atol=2e-3)
+    night = ss.Sun(one.sun.direction, Earth(one.sun.direction))
+    assert run.predict(camera, night).rgb.max() == 0 < run.predict(camera, night).alpha.max()
     with pytest.raises(InputError, match="sun: expected its direction for a run of nerf-relight, found none"):
         run.predict(camera)
     with pytest.raises(InputError, match="exposure"):

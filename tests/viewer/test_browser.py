@@ -96,6 +96,40 @@ def test_it_opens_with_the_scene(viewer, tab):
         assert words.lower() in text.lower() or words == "CPU (LLVM)"
 
 
+def test_beside_the_truth_nothing_can_be_grabbed(viewer, tab, at_start):
+    """Handles fill the window, and both pictures a half of it."""
+
+    def blue() -> int:
+        picture = settled(tab.page, tab.client)
+        return int(((picture[..., 2] > 180) & (picture[..., 0] < 90)).sum())
+
+    compare = tab.client.controls.compare._impl.uuid
+    assert blue() > 50
+    choose(tab.page, compare, "beside")
+    wait_for(lambda: tab.client.session.settings.compare == "beside", "beside")
+    assert blue() == 0
+    choose(tab.page, compare, "off")
+    wait_for(lambda: tab.client.session.settings.compare == "off", "off")
+    assert blue() > 50
+
+
+def test_a_narrow_window_shows_the_whole_width_at_first(viewer, browser):
+    client = opened_tab(viewer, browser, 800, 700).client
+    first = viewer._server.initial_camera
+
+    def widened() -> bool:
+        view = client.session.view
+        return view.width < view.height and np.isclose(
+            np.tan(0.5 * view.fov) * view.width / view.height, np.tan(0.5 * first.fov), rtol=1e-3
+        )
+
+    wait_for(widened, "a wider view")
+    client.look_from(client.session.view.world_from_camera, first.fov)  # whoever moves has the view that was chosen
+    wait_for(lambda: np.isclose(client.session.view.fov, first.fov), "that view")
+    client.handle.camera.fov = 0.9 * first.fov
+    wait_for(lambda: np.isclose(client.session.view.fov, 0.9 * first.fov), "another one")
+
+
 def test_a_dragged_gizmo_moves_its_model(viewer, tab, at_start):
     choose_mode(tab, "object id")
     before = settled(tab.page, tab.client)

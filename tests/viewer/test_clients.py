@@ -117,7 +117,7 @@ def test_nonsense_of_a_client_harms_no_other(viewer, at_start, caplog, capfd):
             what = rng.choice(["value", "update_cb", "label"])
             values = {"uuid": rng.choice(known + uuids), "updates": {what: anything()}}
         if name.startswith("TransformControls"):
-            values |= {"name": "/models/0", "owner": ""}
+            values |= {"name": "/handles/models/0", "owner": ""}
         return msgspec.msgpack.encode({"type": name, **values})
 
     socket = connected(viewer)
@@ -295,7 +295,7 @@ def test_wild_values_that_are_admitted_fail_no_picture(viewer, at_start, caplog)
         (number,) = set(viewer.clients) - before
         for k in range(25):
             model = int(rng.integers(2))
-            handle = {"type": "TransformControlsUpdateMessage", "name": f"/models/{model}", "owner": ""}
+            handle = {"type": "TransformControlsUpdateMessage", "name": f"/handles/models/{model}", "owner": ""}
             wild.send(msgspec.msgpack.encode({**handle, "wxyz": turn(), "position": place()}))
             press(wild, scales[model], size(MIN_SCALE, MAX_SCALE))
             press(wild, viewer._sun.azimuth, float(rng.uniform(0, 360)))
@@ -506,7 +506,7 @@ def test_a_click_on_a_camera_of_the_data_looks_from_there(viewer, at_start):
                     place = message["position"]
             if len(names) == len(viewer.setup.dataset.frames):
                 rays = {"ray_origin": [0.0] * 3, "ray_direction": [0.0, 0, 1], "screen_pos": [0.5, 0.5]}
-                click = {"name": "/cameras/3", "instance_index": None, "modifier": None, "owner": owner, **rays}
+                click = {"name": "/handles/cameras/3", "instance_index": None, "modifier": None, "owner": owner, **rays}
                 socket.send(msgspec.msgpack.encode({"type": "SceneNodeClickMessage", **click}))
                 names = set()
         assert place == pytest.approx(frame.camera.position.tolist())
@@ -546,7 +546,7 @@ def test_only_the_render_thread_asks_dr_jit(viewer, at_start, monkeypatch):
         for mode in ("depth", "object id", "ellipsoids", "normals", "colour"):
             press(socket, client.controls.mode, mode)
             pictures(socket, 1)
-        moved = {"type": "TransformControlsUpdateMessage", "name": "/models/0", "owner": ""}
+        moved = {"type": "TransformControlsUpdateMessage", "name": "/handles/models/0", "owner": ""}
         socket.send(msgspec.msgpack.encode({**moved, "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 0.2]}))
         pictures(socket, 1)
         socket.send(camera_message(0.5))

@@ -57,6 +57,13 @@ function interpolateRow(table, side, width, sun) {
   return row;
 }
 
+/** The share that the Earth leaves of a Sun 1 au away: before its disc the limb is a straight line. */
+function pastEarth(sun, { direction, radius }) {
+  const c = Math.acos(Math.min(Math.max(sun.reduce((sum, s, i) => sum + s * direction[i], 0), -1), 1));
+  const x = Math.min(Math.max((c - radius) / 0.0046505, -1), 1);
+  return 0.5 + (x * Math.sqrt(1 - x * x) + Math.asin(x)) / Math.PI;
+}
+
 /** Write what a Sun gives each Gaussian into `front` and `back` [N, 4]: light that bounces onto the side to which its
  * normal points, and onto the other; in front's alpha how much of the Sun it sees. */
 function lightUp(about, arrays, sun, front, back) {

@@ -97,6 +97,7 @@ class Renderer {
     gl.uniform3fv(this.#at("eye"), camera.eye);
     gl.uniform3fv(this.#at("sun"), sun);
     gl.uniform1f(this.#at("offset"), about.offset);
+    gl.uniform1f(this.#at("past"), about.earth ? pastEarth(sun, about.earth) : 1);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

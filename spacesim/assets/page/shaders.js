@@ -10,7 +10,7 @@ const SHADE_FRAGMENT = `
 uniform sampler2D means, normals, front, back;
 uniform mediump sampler2DArray colors;
 uniform vec3 eye, sun;
-uniform float offset;
+uniform float offset, past; // the Earth: the share of sunlight
 out vec4 shown;
 
 vec3 decode(vec3 v) { return mix(v / 12.92, pow((v + 0.055) / 1.055, vec3(2.4)), step(0.04045, v)); }
@@ -67,6 +67,7 @@ void main() {
   normal *= (turned ? -1.0 : 1.0) * inversesqrt(max(dot(normal, normal), 1e-12));
   vec4 light = texelFetch(front, at, 0);
   vec3 color = max(colorSeen(at, normal, direction) + offset, 0.0) * light.a;
+  if (past < 1.0) color = LINEAR ? past * color : encode(past * decode(color));
 #ifdef BOUNCE
   vec3 bounced = turned ? texelFetch(back, at, 0).rgb : light.rgb;
   color = LINEAR ? color + bounced : encode(decode(color) + bounced);

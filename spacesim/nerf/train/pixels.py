@@ -1,7 +1,7 @@
 """The training pixels whose rays cross the box, on the device: those of others show nothing that a field can learn."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -14,6 +14,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset
+from spacesim.learning.lights import sunlit_frames
 from spacesim.nerf.sampling.box import SceneBox
 from spacesim.nerf.sampling.rays import camera_rows
 
@@ -36,10 +37,10 @@ class Pixels:
 
 
 def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
-    """Of a dataset's training pictures. suns: each must name its Sun.
+    """Of a dataset's training pictures. suns: each must name its Sun, and those of `sunlit_frames` are taken.
 
-    Raises InputError where no ray of a pixel that counts crosses the box, and for a picture without a Sun; MemoryError
-    where the pixels do not fit.
+    Raises InputError where no ray of a pixel that counts crosses the box, for a picture without a Sun, and where
+    `sunlit_frames` does; MemoryError where the pixels do not fit.
     """
     if not dataset.train:
         raise InputError(f"{dataset.root}: expected at least one training image, found none")
@@ -49,6 +50,8 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
                 f"{dataset.root}: expected sun_direction in every training frame, or the method nerf, which takes "
                 f"no Sun, found none in {frame.file_path}"
             )
+    if suns:
+        dataset = replace(dataset, train=tuple(dataset.train[number] for number in sunlit_frames(dataset)))
     parts: list[tuple[np.ndarray, ...]] = []
     outside: list[str] = []
     for number, frame in enumerate(dataset.train):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spacesim.data.earth import ASTRONOMICAL_UNIT_KM, SOLAR_RADIUS_KM
 from spacesim.data.errors import expect
 from spacesim.data.geometry import Array
 
@@ -14,9 +15,6 @@ each of R, G and B has this value."""
 
 EXPOSURE = math.pi / SOLAR_IRRADIANCE
 """Factor from radiance to display value: a white Lambertian surface that faces the Sun at 1 au has linear value 1."""
-
-SOLAR_RADIUS_KM, ASTRONOMICAL_UNIT_KM = 695_700.0, 149_597_870.7
-"""Nominal solar radius (IAU 2015 Resolution B3) and astronomical unit (IAU 2012 Resolution B2)."""
 
 SHAPES = ("disc", "directional")
 

@@ -20,9 +20,10 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spacesim.data.earth import ASTRONOMICAL_UNIT_KM, SOLAR_RADIUS_KM
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
-from spacesim.scenes.lights.sun import ASTRONOMICAL_UNIT_KM, SOLAR_IRRADIANCE, SOLAR_RADIUS_KM
+from spacesim.scenes.lights.sun import SOLAR_IRRADIANCE
 
 TABLE = Path(__file__).parents[2] / "assets" / "solar_spectrum.csv"
 

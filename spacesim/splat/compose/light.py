@@ -99,7 +99,7 @@ class EnsembleLight:
         near, towards = pose.camera_in_model(camera), None if self.sun is None else pose.direction_in_model(self.sun)
         direction = b"" if towards is None else towards.tobytes()
         sunlight = self.cache.get(("sunlight", k), direction, lambda: member.sunlight(towards))
-        earth = pose.earth_in_model(self.earth) if member.run.knows_earth else None
+        earth = pose.earth_in_model(self.earth) if member.run.light else None
         alone = None if earth is None else share  # where the Earth shines, too, sunlight alone is dimmed
         key = near.world_from_camera.tobytes(), direction, earth, None if alone is None else self._key_between
 
@@ -109,9 +109,15 @@ class EnsembleLight:
             return member.shade(Pinhole.of(near), towards, arriving, earth)
 
         part = self.cache.get(("light", k), key, compute)
-        if alone is None:
-            return _dim(part, share)
-        return part[0], part[1] if member.run.has_shadows else share
+        colors, visibility = _dim(part, share) if alone is None else part
+        return colors, visibility if member.run.has_shadows else self._past_earth(share, member.count)
+
+    def _past_earth(self, share: Float | None, count: int) -> Float | None:
+        """The share of sunlight that reaches a member without shadows of its own, as `_lit` takes it."""
+        left = 1.0 if self.sun is None or self.earth is None else self.earth.visible_sun(self.sun)
+        if left == 1:
+            return share
+        return dr.opaque(ad.Float, left, count) if share is None else share * dr.opaque(ad.Float, left)
 
     def _cross_visibility(self, sun: Array, k: int) -> Float | None:
         """v_inter of 4.15 for member k, in its own frame: what is seen of the Sun depends neither on where all stands

@@ -26,7 +26,7 @@ def bake_scene(composition: GaussianComposition, sun: Sun | None) -> Gaussians:
         run, gaussians = model.run, model.run.gaussians
         if run.light is not None:
             direction = None if sun is None else model.pose.direction_in_model(sun.direction)
-            earth = model.pose.earth_in_model(sun.earth) if sun and run.knows_earth else None
+            earth = model.pose.earth_in_model(sun.earth) if sun else None
             # linear colours are dimmed before their tone curve
             gaussians = bake(gaussians, run.light, direction, others=visible, earth=earth)
         harmonics = gaussians.to_numpy()["sh"].astype(np.float64)

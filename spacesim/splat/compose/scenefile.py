@@ -57,9 +57,9 @@ def load_scene(
     keyframes = [_keyframe(keyframe, k, entry, models, width, document) for k, keyframe in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
     sun, earth = entry.sun.sun if entry.sun else None, entry.earth.earth if entry.earth else None
-    if earth and not composition.knows_earth:
+    if earth and not any(model.run.relightable for model in models):
         where = document.label(("earth",))
-        raise InputError(f"{where}: expected a model that has learned the Earth's light (light.earth), found none")
+        raise InputError(f"{where}: expected a model that the Sun relights, found none")
     if earth and (without := [model.name for model in models if not model.run.knows_earth]):
         log.info("%s: has not learned the Earth's light and is drawn without it", ", ".join(without))
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps, earth)
@@ -83,7 +83,7 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     if scene.sun is not None:
         values["sun"] = _sun_values(scene.sun)
     earth = (scene.sun and scene.sun.earth) or scene.earth
-    if earth is not None and scene.composition.knows_earth:
+    if earth is not None and any(model.run.relightable for model in scene.composition.models):
         values["earth"] = _sun_values(Sun(earth.direction))
         values["earth"] |= {"angular_radius_deg": float(earth.angular_radius_deg), "albedo": float(earth.albedo)}
     if scene.camera is not None:

@@ -19,6 +19,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
 from spacesim.learning import mlp
+from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
@@ -158,8 +159,8 @@ class LightModel:
 
     def encode_sun(self, sun: np.ndarray | None, earth: Earth | None = None) -> SunEncoding:
         """What kernels read of a Sun in the direction `sun` [3], unit, world axes; None: the field does not take it.
-        earth: that it lights, if there is one; a model that has not learned its light takes none"""
-        earth = earth if self.config.earth and sun is not None else None
+        earth: that it lights, if there is one, and that may hide it; light of it has a model that has learned it"""
+        earth = earth if self.config.field.knows_sun and sun is not None else None
         terms: SunEncoding = self._encodings(earth, *(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
@@ -351,8 +352,12 @@ class LightModel:
 
     def _encode_sun(self, earth: Earth | None, *sun: float) -> SunEncoding:
         refine = self.config.refine or self.config.field
-        beams = [upload(earth.beams(np.array(sun)))] if earth else []
-        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams)
+        beams, eclipse = [], []
+        if earth and earth.albedo > 0 and self.config.earth:
+            beams = [upload(earth.beams(np.array(sun)))]
+        if earth and (share := earth.visible_sun(np.array(sun))) < 1:
+            eclipse = [upload(eclipse_numbers(share, self.config.linear))]
+        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams, eclipse)
         dr.eval(terms)
         return terms
 

@@ -11,6 +11,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf
 from spacesim.learning import mlp
 from spacesim.learning.mlp import round_up_rows
+from spacesim.learning.reflectance import past_earth
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import Scatterers, add_irradiance, add_irradiance_slopes, irradiance
 from spacesim.splat.light.config import LightConfig
@@ -44,6 +45,17 @@ class SunEncoding:
     field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
     refine_encoding: Float  #: input of the refinement's network
     beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
+    eclipse: list[Float]  #: where the Earth hides some of the Sun, Float [2] of `eclipse_numbers` in a list, or nothing
+
+    def left(self, light: list[Float]) -> list[Float]:
+        """What the Earth leaves of sunlight [M]."""
+        return [value * dr.gather(ad.Float, left, ad.UInt32(0)) for left in self.eclipse for value in light] or light
+
+    def colors_left(self, colors: list[Float]) -> tuple[list[Float], list[Float]]:
+        """`past_earth` of colours [M], which are as they were where there is no eclipse."""
+        for numbers in self.eclipse:
+            return past_earth(colors, numbers)
+        return colors, [ad.Float(1) for _ in colors]
 
 
 @dataclass
@@ -85,12 +97,12 @@ def shade(
     colors = [mlp.sigmoid(batch.row(output, i)) for i in range(3)]
     occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
-    outputs = _dimmed(colors, [1 - value for value in occlusion], faces)
+    outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
     bounced = []
     if config.bounce:
         bounced = irradiance(_scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], batch)
-    scattered = _scattered(config, field_inputs, bounced, batch)
+    scattered = _scattered(config, field_inputs, inputs.sun.left(bounced), batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
@@ -121,10 +133,10 @@ def shade_picture(
         rows = batch.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
     colors = [mlp.sigmoid(value) for value in outputs]
-    shown = _dimmed(
-        colors, [batch.pad_zeros(value) for value in visibility], sun_facing(field, field_inputs, views, batch)
-    )
-    scattered = _scattered(config, field_inputs, [batch.pad_zeros(light) for light in bounced], batch)
+    faces = sun_facing(field, field_inputs, views, batch)
+    shown = _dimmed(inputs.sun, colors, [batch.pad_zeros(value) for value in visibility], faces)
+    arriving = inputs.sun.left([batch.pad_zeros(light) for light in bounced])
+    scattered = _scattered(config, field_inputs, arriving, batch)
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
@@ -152,11 +164,13 @@ def first_layer_of_features(
     return mlp.first_layer_part(field.shape, weights, items, field.features)
 
 
-def _dimmed(colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
-    """Colours [M] dimmed by visibility ([M] in a list, or nothing), then that as it is shown. faces: of `sun_facing`"""
+def _dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
+    """Colours [M] dimmed by the Earth and by visibility ([M] in a list, or nothing), then that as it is shown. faces:
+    of `sun_facing`"""
     if not visibility:
-        return colors
-    return [color * visibility[0] for color in colors] + [_picture_visibility(visibility[0], faces)]
+        return sun.colors_left(colors)[0]
+    dimmed, _ = sun.colors_left([color * visibility[0] for color in colors])
+    return dimmed + sun.left([_picture_visibility(visibility[0], faces)])
 
 
 def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
@@ -195,11 +209,12 @@ def adjoint(
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]
     grad_albedo: list[Float] = []
     grad_earth: list[Float] = []
+    dimmed, slopes = inputs.sun.colors_left([color * visibility for color in tape.colors])
     if tape.scattered:
-        dimmed = [color * visibility for color in tape.colors]
         gradients, grad_albedo, grad_earth = _scattered_adjoint(
             config, inputs, gradients, dimmed, tape.scattered, batch
         )
+    gradients = [gradient * slope for gradient, slope in zip(gradients, slopes, strict=True)]
     pairs = list(zip(gradients, tape.colors, strict=True))
     grad_output = batch.matrix([g * visibility * c * (1 - c) for g, c in pairs])
     grad_weights, grad_items = mlp.backward(
@@ -209,7 +224,7 @@ def adjoint(
     if config.field.embeddings or by_sun:
         by_encoding = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
     parts = [(grad_items, 0, config.field.features)]
-    grad_shown = [batch.pad_zeros(gradient) for gradient in grad_visibility]
+    grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
     grad_sun = []
     if by_sun:

@@ -15,6 +15,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Truth
 from spacesim.data.store import load_truth
+from spacesim.learning.lights import sunlit_frames
 from spacesim.splat.train.loss.terms import TruthPlanes
 
 log = logging.getLogger(__name__)
@@ -46,10 +47,10 @@ class TrainingViews:
     """Views of a dataset's training frames by index, decoded at first use and kept while memory suffices, see
     `kept_bytes`.
 
-    suns: every frame must name its Sun; those whose Sun its Earth hides are not trained on, where others are left
+    suns: every frame must name its Sun; see `sunlit_frames`
     truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
-    Raises InputError where a frame has not what it must have.
+    Raises InputError where a frame has not what it must have, and where `sunlit_frames` does.
     """
 
     def __init__(
@@ -67,11 +68,7 @@ class TrainingViews:
         self.dataset, self.seed, self.truth, self.surface = dataset, seed, tuple(truth), surface
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name in ("normal", "radiance") else 1 for name in truth))
-        sunlit = [i for i, f in enumerate(dataset.train) if not (suns and f.sun is not None and f.sun.is_hidden)]
-        if 0 < len(sunlit) < len(dataset.train):
-            dark = len(dataset.train) - len(sunlit)
-            log.warning("%d of %d training frames are left out: the Earth hides their Sun", dark, len(dataset.train))
-        self._used = sunlit or list(range(len(dataset.train)))
+        self._used = sunlit_frames(dataset) if suns else list(range(len(dataset.train)))
         self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=1)(self._shuffle)
         in_memory, on_device = kept_bytes()

@@ -43,7 +43,6 @@ class SceneRenderer:
     progressive: whether a picture takes so long that it comes in steps, of radiance fields
     modes: of `MODES`, those that there can be
     relightable: whether the Sun changes the picture
-    knows_earth: whether the light of the Sun's Earth does
     backend: that draws
     """
 
@@ -55,7 +54,6 @@ class SceneRenderer:
         self.progressive = not isinstance(composition, GaussianComposition)
         self.modes = tuple(mode for mode in MODES if mode not in OF_GAUSSIANS or not self.progressive)
         self.relightable = composition.relightable
-        self.knows_earth = composition.knows_earth
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(

@@ -21,19 +21,19 @@ SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
 class SunControls:
     """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters. A box where
-    a model knows the light of the Earth, and one is named: it stays where the data or the scene have it."""
+    an Earth is named: it stays where the data or the scene have it."""
 
-    def __init__(self, gui: "viser.GuiApi", shared: SharedScene, knows_earth: bool = False) -> None:
+    def __init__(self, gui: "viser.GuiApi", shared: SharedScene) -> None:
         self._shared = shared
         sun = shared.state.sun
         azimuth, elevation = sun.angles if sun else (0.0, 0.0)
-        self._named = sun.earth if sun and knows_earth else None
+        self._named = sun.earth if sun else None
         self.earth: viser.GuiCheckboxHandle | None = None
         with gui.add_folder("Sun", order=2):
             self.azimuth = gui.add_slider("Azimuth", 0.0, 360.0, 0.1, round(azimuth, 1), hint="degrees, from +x to +y")
             self.elevation = gui.add_slider("Elevation", -90.0, 90.0, 0.1, round(elevation, 1), hint="degrees above xy")
             if self._named is not None:
-                self.earth = gui.add_checkbox("Earth", True, hint="its light, from where the data have it")
+                self.earth = gui.add_checkbox("Earth", True, hint="its light and shadow, from where the data have it")
                 self.earth.on_update(self._on_change)
         self.azimuth.on_update(self._on_change)
         self.elevation.on_update(self._on_change)
@@ -117,6 +117,9 @@ class Actions(Protocol):
     def show_frusta(self, visible: bool) -> None:
         """Show or hide the cameras of the data."""
 
+    def show_handles(self, visible: bool) -> None:
+        """Show or hide all that can be grabbed."""
+
     def save_picture(self) -> None:
         """Send a PNG of the view."""
 
@@ -159,6 +162,7 @@ class ClientControls:
         mode.on_update(_call(lambda: session.change_settings(mode=mode.value)))
         side.on_update(_call(lambda: session.change_settings(side=side.value)))
         compare.on_update(_call(lambda: session.change_settings(compare=compare.value)))
+        compare.on_update(_call(lambda: actions.show_handles(compare.value != "beside")))  # they fill the window
         wipe.on_update(_call(lambda: session.change_settings(wipe=wipe.value)))
         samples.on_update(_call(lambda: session.change_settings(samples=samples.value)))
         picture.on_click(_call(actions.save_picture))

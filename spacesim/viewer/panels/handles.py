@@ -1,4 +1,5 @@
-"""What can be grabbed in the scene: a gizmo for each model, the Sun on its sphere, the cameras of the data."""
+"""What can be grabbed in the scene: a gizmo for each model, the Sun on its sphere, the cameras of the data. All stand
+under one node, `HANDLES`, which a client hides where its picture is not that of the whole window."""
 
 import math
 from collections.abc import Awaitable, Callable
@@ -16,6 +17,7 @@ from spacesim.viewer.state import SceneState, SharedScene, pose_from_handle
 if TYPE_CHECKING:
     import viser
 
+HANDLES = "/handles"  #: name of the node above them
 SUN_AWAY = 1.15  #: distance of the Sun's handle from the middle, in radii of the scene
 GIZMO = 0.5  #: length of a gizmo's axes, in radii of the model
 FRUSTUM = 0.06  #: size of a frustum, in radii of the scene
@@ -61,7 +63,7 @@ class Gizmos:
         self._shared = shared
         self._handles = [
             scene.add_transform_controls(
-                f"/models/{k}",
+                f"{HANDLES}/models/{k}",
                 scale=_gizmo_size(model.radius, pose),
                 position=tuple(pose.translation),
                 wxyz=tuple(pose.quaternion),
@@ -106,11 +108,11 @@ class SunHandle:
         self._renderer, self._shared, self._dragged = renderer, shared, dragged
         radius = self._place(shared.state)[1]
         self._size = radius
-        self._frame = scene.add_frame("/sun", show_axes=False)
-        ball = scene.add_icosphere("/sun/ball", radius=0.04 * radius, color=SUN_COLOR, cast_shadow=False)
+        self._frame = scene.add_frame(f"{HANDLES}/sun", show_axes=False)
+        ball = scene.add_icosphere(f"{HANDLES}/sun/ball", radius=0.04 * radius, color=SUN_COLOR, cast_shadow=False)
         points = np.array([[[0, 0, -0.06 * radius], [0, 0, -0.22 * radius]]], np.float32)
         scene.add_arrows(
-            "/sun/arrow",
+            f"{HANDLES}/sun/arrow",
             points,
             np.array(SUN_COLOR, np.uint8),
             shaft_radius=0.008 * radius,
@@ -179,7 +181,7 @@ def add_frusta(
     for spot in dataset_cameras(dataset):
         camera = dataset.frames[spot.frame].camera
         handle = scene.add_camera_frustum(
-            f"/cameras/{spot.frame}",
+            f"{HANDLES}/cameras/{spot.frame}",
             fov=2 * math.atan(0.5 * camera.height / camera.fy),
             aspect=camera.width / camera.height * camera.fy / camera.fx,
             scale=size,

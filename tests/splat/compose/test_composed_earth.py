@@ -119,11 +119,23 @@ def test_a_scene_file_names_it(scene_file, tmp_path):
         assert load_scene(tmp_path / "again.toml").sun_at(0.0).earth == EARTH
 
 
-def test_what_no_model_knows_is_not_saved(tmp_path):
-    save_scene(tmp_path / "scene.toml", PosedScene(GaussianComposition([PlacedRun(made_run("map"), name="one")]), BOTH))
+@pytest.mark.parametrize(("run", "saved"), [(made_run("map"), True), (disc_run(1.0), False)], ids=("relit", "plain"))
+def test_what_changes_no_model_is_not_saved(tmp_path, run, saved):
+    """To one that has not learned its light it hides the Sun."""
+    save_scene(tmp_path / "scene.toml", PosedScene(GaussianComposition([PlacedRun(run, name="one")]), BOTH))
     text = (tmp_path / "scene.toml").read_text()
     assert "[sun]" in text
-    assert "[earth]" not in text
+    assert ("[earth]" in text) == saved
+
+
+def test_it_hides_the_sun_from_all_models(scene_file, monkeypatch):
+    """In a scene's file, whoever has learned its light."""
+    for one in (made_run("bounce", 3), made_run("map")):
+        monkeypatch.setattr(scenefile, "load_run", lambda _path, one=one: one)
+        scene_file.write_text(SCENE.replace("azimuth_deg = 40\nelevation_deg = 35", "direction = [0.3, 0, -1]"))
+        night = load_scene(scene_file).render()
+        assert night.rgb.max() == 0 < night.alpha.max()
+        assert load_scene(scene_file).render(sun=(40, 35)).rgb.max() > 0.1
 
 
 def test_the_viewer_begins_with_it(scene_file, monkeypatch):
@@ -133,7 +145,6 @@ def test_the_viewer_begins_with_it(scene_file, monkeypatch):
     for text in (SCENE, SCENE.replace("[sun]\nazimuth_deg = 40\nelevation_deg = 35\n", "")):
         scene_file.write_text(text)
         setup = load.load_setup(scene_file)
-        assert setup.renderer.knows_earth
         assert setup.state.sun.earth == EARTH
 
 
@@ -163,7 +174,7 @@ def test_what_is_wrong_is_said_with_its_line(scene_file, wrong):
         load_scene(scene_file)
 
 
-def test_a_scene_whose_models_do_not_know_it_is_refused(scene_file, monkeypatch):
-    monkeypatch.setattr(scenefile, "load_run", lambda _path: made_run("map"))
-    with pytest.raises(InputError, match=r"line 7: earth: expected a model that has learned .*, found none"):
+def test_a_scene_of_models_of_one_light_is_refused(scene_file, monkeypatch):
+    monkeypatch.setattr(scenefile, "load_run", lambda _path: disc_run(1.0))
+    with pytest.raises(InputError, match=r"line 7: earth: expected a model that the Sun relights, found none"):
         load_scene(scene_file)

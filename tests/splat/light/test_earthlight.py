@@ -14,15 +14,19 @@ from spacesim.data.images import linear_from_srgb, read_png
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import load_truth
 from spacesim.learning.lights import added_light
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes import Renderer, build, generate, read_scene
 from spacesim.scenes.lights.earth import EarthConfig
-from spacesim.serve.draw import PredictedRun
+from spacesim.scenes.lights.sun import SunConfig
+from spacesim.serve.draw import load_served
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
+from spacesim.splat.compose.plain import bake_scene
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.pose.picture import SunlitRun
+from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.render import render
 from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import preset, with_settings
 from spacesim.splat.train.train import train
@@ -129,10 +133,101 @@ def test_where_no_earth_is_given_there_is_none(run, earthlit):
     np.testing.assert_allclose(drawn.draw(frame.camera, drawn.shade(frame.camera))[..., :3], both, atol=1e-5)
 
 
-def test_the_earths_night_side_adds_nothing(run, earthlit):
+def beside_the_limb(frame, radii: float) -> Sun:
+    """The frame's Earth, and a Sun above its limb by so many radii of the Sun."""
+    earth = frame.sun.earth
+    angle = np.radians(earth.angular_radius_deg - 90) + radii * SunConfig().angular_radius
+    return Sun(np.array([0.8 * np.cos(angle), 0.6 * np.cos(angle), np.sin(angle)]), earth)
+
+
+def light_seen(prediction) -> float:
+    """Where it is opaque: what is not is blended as sRGB values."""
+    return float(linear_from_srgb(prediction.rgb[prediction.alpha > 0.9]).sum())
+
+
+@pytest.fixture(scope="module")
+def shadowed(earthlit, tmp_path_factory) -> Run:
+    """One that casts shadows and has not learned the Earth's light."""
+    config = with_settings(preset("demo", "shadow-map"), {"light.earth": False, "init_count": 1500})
+    return train(earthlit, tmp_path_factory.mktemp("shadowed") / "run", replace(config, iterations=200))
+
+
+@pytest.mark.parametrize("radii", [-3.0, -0.5, 0.4, 3.0])
+def test_the_earth_hides_the_sun_as_it_does_from_the_path_tracer(run, shadowed, earthlit, radii):
+    """Behind it there is nothing left: the side of it that is seen is dark, too."""
     frame = earthlit.test[0]
-    behind = replace(frame.sun, earth=Earth(frame.sun.direction, 20.0))
-    np.testing.assert_allclose(run.predict(frame.camera, behind).rgb, pictures(run, frame)[1], atol=1e-6)
+    free, sun = (beside_the_limb(frame, one) for one in (3.0, radii))
+    scene = replace(read_scene("boxsat"), earth=EarthConfig(altitude_km=600.0, albedo=0.9))
+    tracer = Renderer(build(scene), 256)
+    traced = [tracer.render(frame.camera, one, (1,)).radiance.sum() for one in (free, sun)]
+    for model in (run, shadowed):
+        seen = [model.predict(frame.camera, one) for one in (free, sun)]
+        assert light_seen(seen[0]) > 1
+        share = light_seen(seen[1]) / light_seen(seen[0])
+        assert share == pytest.approx(traced[1] / traced[0], abs=0.05)
+        assert share == pytest.approx(sun.visible_share, abs=0.03)
+    unhidden = shadowed.predict(frame.camera, replace(sun, earth=None))
+    np.testing.assert_allclose(seen[1].visibility, sun.visible_share * unhidden.visibility, atol=1e-5)
+
+
+def test_all_that_draw_know_the_eclipse(run, shadowed, earthlit):
+    """Behind the Earth all is black; in the penumbra they agree, and the layers add up to the whole."""
+    frame = earthlit.test[0]
+    night, dim = (beside_the_limb(frame, radii) for radii in (-2.0, 0.2))
+    turned = Pose(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), [0.4, -0.2, 0.1], 1.0)
+    for model in (run, shadowed):
+        alone = model.predict(frame.camera, dim)
+        pair = GaussianComposition([PlacedRun(model), PlacedRun(model, Pose(np.eye(3), [0, 0, 50.0], 1.0))])
+        drawn = SunlitRun.of(model, dim)
+        for rgb in (
+            GaussianComposition([PlacedRun(model)]).predict(frame.camera, dim).rgb,
+            pair.predict(frame.camera, dim).rgb,
+            drawn.draw(frame.camera, drawn.shade(frame.camera))[..., :3],
+        ):
+            np.testing.assert_allclose(rgb, alone.rgb, atol=1e-4)
+        there = moved_frame(replace(frame, sun=dim), turned)
+        np.testing.assert_allclose(AlignedRun(model, turned).predict(there.camera, there.sun).rgb, alone.rgb, atol=5e-3)
+        assert model.predict(frame.camera, night).rgb.max() == 0
+        assert pair.predict(frame.camera, night).rgb.max() == 0
+        baked = bake_scene(pair, night)
+        assert render(baked, Pinhole.of(frame.camera)).image("color").max() < 0.01
+    both = linear_from_srgb(run.predict(frame.camera, dim).rgb)
+    layers = [linear_from_srgb(run.render(frame.camera, dim, light=light).rgb) for light in ("sun", "earth")]
+    np.testing.assert_allclose(sum(layers), both, atol=1e-5)
+    assert run.render(frame.camera, night, light="earth").rgb.max() == 0
+
+
+def test_what_is_seen_of_the_sun_in_a_scene_without_own_shadows(run, shadowed, earthlit):
+    frame = earthlit.test[0]
+    dim = beside_the_limb(frame, 0.2)
+    away = Pose(np.eye(3), [0, 0, 50.0], 1.0)
+    seen = GaussianComposition([PlacedRun(run), PlacedRun(shadowed, away)]).predict(frame.camera, dim)
+    assert seen.visibility[seen.alpha > 0.9] == pytest.approx(dim.visible_share, abs=1e-3)
+
+
+def test_render_hides_the_sun_behind_a_named_earth(spacesim, run, shadowed, tmp_path, caplog):
+    """A sentence says where that is all that it does."""
+    for model in (run, shadowed):
+        done = spacesim(
+            "render", model.path, "--frame", 16, "--sun", "10,-60", "--earth", "0,-80", "--out", tmp_path / "a.png"
+        )
+        assert done.code == 0, done.errors
+        assert read_png(tmp_path / "a.png")[..., :3].max() == 0
+        assert ("has not learned the Earth's light" in caplog.text) == (model is shadowed)
+
+
+def test_a_model_of_one_light_has_no_eclipse(earthlit, tmp_path):
+    run = train(earthlit, tmp_path / "run", replace(preset("demo", "vanilla"), iterations=1, init_count=300))
+    frame = earthlit.test[0]
+    night = run.predict(frame.camera, beside_the_limb(frame, -2.0)).rgb
+    np.testing.assert_array_equal(night, run.predict(frame.camera, frame.sun).rgb)
+    assert night.max() > 0.1
+
+
+def test_training_needs_a_sun_that_is_seen(earthlit, tmp_path):
+    dark = [replace(frame, sun=beside_the_limb(frame, -2.0)) for frame in earthlit.train]
+    with pytest.raises(InputError, match="expected a training frame whose Sun the Earth does not hide, found none"):
+        train(replace(earthlit, train=tuple(dark)), tmp_path / "run", CONFIG)
 
 
 def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
@@ -184,7 +279,10 @@ def test_exports_have_it_where_it_is_named(spacesim, run, tmp_path, form):
     assert contents[0] == contents[1] != contents[2]
 
 
-def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, run, earthlit, tmp_path):
+@pytest.mark.parametrize("model", ["run", "shadowed"])
+def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, request, model, earthlit, tmp_path):
+    """Whose shadow falls on models that have not learned its light, too."""
+    run = request.getfixturevalue(model)
     options = "--frame", 16, "--frames", 1, "--keep-frames", "--out", tmp_path / "sweep"
     done = spacesim("sweep", run.path, *options)
     assert done.code == 0, done.errors
@@ -192,10 +290,35 @@ def test_a_sweep_keeps_the_earth_of_its_frame(spacesim, run, earthlit, tmp_path)
     sun = Sun(Sun.from_angles(0, 30).direction, frame.sun.earth)
     (picture,) = (tmp_path / "sweep/frames").iterdir()
     np.testing.assert_allclose(read_png(picture)[..., :3] / 255, run.predict(frame.camera, sun).rgb, atol=1 / 255)
+    night = "--frame", 16, "--frames", 1, "--elevation", -80, "--keep-frames", "--out", tmp_path / "night"
+    assert spacesim("sweep", run.path, *night).code == 0
+    (picture,) = (tmp_path / "night/frames").iterdir()
+    assert read_png(picture)[..., :3].max() == 0
 
 
-def test_a_served_run_says_that_it_is_left_out(run, caplog):
-    PredictedRun(run)
+def test_a_served_run_has_the_earth_of_its_data_or_scene(run, shadowed, earthlit, tmp_path, caplog):
+    frame = earthlit.test[0]
+    elsewhere = replace(frame.sun, earth=Earth(np.array([0.0, 1, 0.3]), 40.0))
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[[models]]\nrun = "{run.path}"\n[earth]\ndirection = [0, 1, 0.3]\nangular_radius_deg = 40\n'
+        "[sun]\nazimuth_deg = 0\nelevation_deg = 0\n"
+    )
+    for what, sun in ((run.path, frame.sun), (scene, elsewhere), (shadowed.path, beside_the_limb(frame, -2.0))):
+        served = load_served(what)
+        (seen,) = served.draw(frame.camera, Sun(sun.direction), None, ("rgb",), 0).values()
+        np.testing.assert_allclose(seen / 255, np.clip(served.run.predict(frame.camera, sun).rgb, 0, 1), atol=1 / 255)
+    assert seen.max() == 0
+    assert "left out" not in caplog.text
+
+
+def test_a_served_run_says_that_it_is_left_out(run, earthlit, caplog):
+    moved = replace(earthlit.train[0].sun, earth=Earth(np.array([0.0, 1, 0])))
+    several = replace(earthlit, root=run.path, train=(replace(earthlit.train[0], sun=moved), *earthlit.train[1:]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spacesim.data.store.read_dataset", lambda _: several)
+        served = load_served(run.path)
+    assert served.earth is None
     assert f"{run.path} has learned the Earth's light, which is left out" in caplog.text
 
 
@@ -206,11 +329,11 @@ def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
     with pytest.raises(InputError, match=r"expected earth_direction in every training frame .*, found none in images/"):
         train(small_lit_dataset, tmp_path / "run", needed)
     blind = train(small_lit_dataset, tmp_path / "blind", replace(CONFIG, iterations=1))
-    for option in (("--earth", "0,0"), ("--sun", "none")):
-        done = spacesim("render", blind.path, *option, "--out", tmp_path / "a.png")
-        assert done.is_refusal(option[0], "light.earth", blind.path)
-    refused = spacesim("export", blind.path, "--ply", tmp_path / "a.ply", "--sun", "0,0", "--earth", "0,0")
-    assert refused.is_refusal("--earth", "light.earth", blind.path)
+    done = spacesim("render", blind.path, "--sun", "none", "--out", tmp_path / "a.png")
+    assert done.is_refusal("--sun", "light.earth", blind.path)
+    plain = train(small_lit_dataset, tmp_path / "plain", replace(preset("demo", "vanilla"), iterations=1))
+    refused = spacesim("render", plain.path, "--earth", "0,0", "--out", tmp_path / "a.png")
+    assert refused.is_refusal("--earth", "expected a run that the Sun relights", plain.path)
     refused = spacesim("export", blind.path, "--mesh", tmp_path / "a.ply", "--earth", "0,0")
     assert refused.is_refusal("--earth", "expected with --sun, --html, found without one")
     frame = small_lit_dataset.test[0]

@@ -47,6 +47,7 @@ from spacesim.splat.train.trainer import Trainer
 
 SUN = np.array([0.48, -0.36, 0.8])
 EARTH = Earth(np.array([-0.6, -0.5, -0.6]), 60.0, albedo=0.9)
+ECLIPSE = Earth([0.48, -0.6, 0.64], np.degrees(np.arccos(0.48**2 + 0.36 * 0.6 + 0.8 * 0.64)) - 0.1)  #: two thirds seen
 ENCODINGS = {"sun": Encoding("harmonics", 2), "view": Encoding("positional", 1)}
 FIELD = FieldConfig(features=5, width=12, layers=3, inputs=DirectionsConfig(**ENCODINGS))
 ON_SURFACE = replace(FIELD, inputs=SurfaceConfig(**ENCODINGS))
@@ -196,12 +197,19 @@ def brightened(light: LightModel, color: np.ndarray, more: np.ndarray) -> np.nda
 
 
 def twin(
-    light: LightModel, arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray], given=None, embedding=None
+    light: LightModel,
+    arrays: dict,
+    weights: list[np.ndarray],
+    raw: list[np.ndarray],
+    given=None,
+    embedding=None,
+    earth=EARTH,
 ) -> tuple:
     """(colours [N, 3], visibility [N] as it is shown, light that bounces) of 4.2, 4.11 to 4.14 and 4.17; raw: occlusion
     and bias info as given; given: light that bounces, instead of that of these numbers; embedding: the mean one
     where none is given."""
     config, field = light.config, light.config.field
+    left = earth.visible_sun(SUN) if field.knows_sun else 1
     direction = arrays["means"] - np.array([0, -6, 1.0])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     features, split = arrays["features"].astype(np.float64), 1 + 2 * field.layers
@@ -218,7 +226,7 @@ def twin(
     color = sigmoid(network(field.shape, weights[:split], items, shared))
     if not raw:
         visible = np.ones(len(color))
-        color, given = with_scattered(light, arrays, color, visible, given)
+        color, given = with_scattered(light, arrays, eclipsed(light, color, left), visible, given, earth)
         return color, visible, given
     occlusion, alignment, thickness, bias = raw
     if config.refine:
@@ -237,31 +245,42 @@ def twin(
         output = network(refine.shape, weights[split:], items, encoded(refine.sun, SUN[None])[0])[:, 0]
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(output + (np.log(sure / (1 - sure)) if refine.residual else 0))
-    color, given = with_scattered(light, arrays, color * (1 - occlusion)[:, None], 1 - occlusion, given)
-    return color, (1 - occlusion) * faces, given
+    color = eclipsed(light, color * (1 - occlusion)[:, None], left)
+    color, given = with_scattered(light, arrays, color, 1 - occlusion, given, earth)
+    return color, left * (1 - occlusion) * faces, given
 
 
-def earthlit(light: LightModel, arrays: dict) -> np.ndarray:
+def eclipsed(light: LightModel, color: np.ndarray, left: float) -> np.ndarray:
+    if left == 1 or light.config.linear:
+        return left * color
+    return np.maximum(left * color, left ** (1 / 2.4) * (color + 0.055) - 0.055)
+
+
+def earthlit(light: LightModel, arrays: dict, earth: Earth = EARTH) -> np.ndarray:
     """[N, 1] irradiance of the side that is seen, one beam after another."""
     first, towards = light.config.field.features, np.array([0, -6, 1.0]) - arrays["means"]
     normals = arrays["features"][:, first : first + 3].astype(np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals *= np.sign((normals * towards).sum(axis=1, keepdims=True))
-    return sum(power * np.maximum(normals @ beam, 0) for *beam, power in EARTH.beams(SUN))[:, None]
+    return sum(power * np.maximum(normals @ beam, 0) for *beam, power in earth.beams(SUN))[:, None]
 
 
-def with_scattered(light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given) -> tuple:
+def with_scattered(light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given, earth) -> tuple:
     """(colours, light that bounces): as they are for a model without bounce and Earth."""
     config = light.config
     if not (config.bounce or config.earth):
         return color, None
     given = bounced(light, arrays, visible) if given is None else given
     albedo = sigmoid(arrays["features"].astype(np.float64)[:, config.albedos :])
-    return brightened(light, color, albedo * (given + (earthlit(light, arrays) if config.earth else 0))), given
+    more = earth.visible_sun(SUN) * given + (earthlit(light, arrays, earth) if config.earth else 0)
+    return brightened(light, color, albedo * more), given
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
+@pytest.mark.parametrize(
+    ("name", "earth"),
+    [*((name, EARTH) for name in CONFIGS), ("earth", ECLIPSE), ("bounce, linear", ECLIPSE), ("no sun", ECLIPSE)],
+)
+def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
     light, count = model(name), 37
     splats = gaussians(count, light.config.features)
     arrays = {key: value.astype(np.float64) for key, value in splats.to_numpy().items()}
@@ -269,8 +288,8 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     shadows = light.shadows(splats, SUN)
     raw = [numbers(row) for row in (shadows.occlusion, *shadows.info)] if shadows else []
     own = embedding_of(light, 3)
-    shading = light.shade(splats, eye(), SUN, picture=3, earth=EARTH)
-    color, visibility, given_light = twin(light, arrays, weights, raw, embedding=own)
+    shading = light.shade(splats, eye(), SUN, picture=3, earth=earth)
+    color, visibility, given_light = twin(light, arrays, weights, raw, embedding=own, earth=earth)
     assert not light.config.bounce or np.abs(given_light).max() > 0.01
     assert not light.config.earth or earthlit(light, arrays).max() > 0.1
     np.testing.assert_allclose(np.stack([numbers(c) for c in shading.colors], axis=1), color, atol=3e-5)
@@ -286,7 +305,7 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name):
     back = light.adjoint(shading, [upload(column) for column in grad_color.T], given)
 
     def loss(arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray] = raw, own: np.ndarray = own) -> float:
-        color, visibility, _ = twin(light, arrays, weights, raw, given_light, own)
+        color, visibility, _ = twin(light, arrays, weights, raw, given_light, own, earth)
         return float((grad_color * color).sum() + grad_visibility @ visibility)
 
     for _ in range(6):  # along random directions, all numbers at once
@@ -360,9 +379,9 @@ def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors
     splats = gaussians(700, light.config.features)
     other_eye = Pinhole.of(Camera(look_at([5, 2, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))
 
-    def same(camera, sun: np.ndarray) -> None:
-        colors, visibility = light.shade_picture(splats, camera, sun, earth=EARTH)
-        trained = light.shade(splats, camera, sun, earth=EARTH)
+    def same(camera, sun: np.ndarray, earth: Earth = EARTH) -> None:
+        colors, visibility = light.shade_picture(splats, camera, sun, earth=earth)
+        trained = light.shade(splats, camera, sun, earth=earth)
         for one, other in zip(colors, trained.colors, strict=True):
             np.testing.assert_allclose(numbers(one), numbers(other), atol=tolerance)
         assert (visibility is None) == (trained.visibility is None)
@@ -372,6 +391,7 @@ def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors
     same(eye(), SUN)
     kept = light._cache
     same(other_eye, -SUN)
+    same(other_eye, SUN, ECLIPSE)
     assert light._cache is kept, "computed again for another Sun"
     splats.features += 0.5  # in place
     same(eye(), SUN)

@@ -6,7 +6,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from spacesim.data.earth import Earth
 from spacesim.data.records import Sun
@@ -42,9 +41,9 @@ class Panel:
             asyncio.run(listener(SimpleNamespace(client=1)))
 
 
-def controls(sun: Sun = SUN, knows_earth: bool = True) -> tuple[Panel, SharedScene, SunControls]:
+def controls(sun: Sun = SUN) -> tuple[Panel, SharedScene, SunControls]:
     panel, shared = Panel(), SharedScene(SceneState((), sun))
-    return panel, shared, SunControls(panel, shared, knows_earth)
+    return panel, shared, SunControls(panel, shared)
 
 
 def test_the_box_takes_the_earth_away_and_brings_it_back():
@@ -75,9 +74,8 @@ def test_the_earth_stays_where_the_sun_is_moved():
     assert panel.handles["Earth"].value is False
 
 
-@pytest.mark.parametrize(("sun", "knows"), [(Sun(SUN.direction), True), (SUN, False)], ids=("unnamed", "unknown"))
-def test_there_is_no_box_without_an_earth(sun, knows):
-    panel, shared, control = controls(sun, knows)
+def test_there_is_no_box_without_an_earth():
+    panel, shared, control = controls(Sun(SUN.direction))
     assert set(panel.handles) == {"Azimuth", "Elevation"}
     control.drag(Sun.from_angles(0, 0))
     assert shared.state.sun.earth is None

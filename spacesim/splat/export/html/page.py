@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import math
 import re
 import zlib
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
+from spacesim.learning.folder import run_name
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
 from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
 from spacesim.splat.export.html.seen import tabulate_seen
@@ -28,10 +30,14 @@ Arrays = dict[str, np.ndarray]
 
 
 def write_page(
-    run: Run, path: Path, report: Callable[[int, int], None] | None = None, earth: Earth | None = None
+    run: Run,
+    path: Path,
+    report: Callable[[int, int], None] | None = None,
+    earth: Earth | None = None,
+    name: str | None = None,
 ) -> None:
     """Write `run` as a page. report: called with (steps done, of all);  earth: that any Sun lights, for a run that
-    `knows_earth`; where it is stays
+    `knows_earth`, and that can hide it; where it is stays;  name: above the picture, by default the run's
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -44,14 +50,14 @@ def write_page(
         raise InputError(
             f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
         )
-    about, arrays = _content(run, report, earth if run.knows_earth else None)
-    write_bytes(Path(path), _page(run, about, arrays).encode())
+    about, arrays = _content(run, report, earth if run.relightable else None)
+    write_bytes(Path(path), _page(run, name or run_name(run.path), about, arrays).encode())
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth | None) -> tuple[JsonDict, Arrays]:
     """The data of the page, and its arrays."""
-    gaussians, light = run.gaussians, run.light
-    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light, earth) if light else 0)
+    gaussians, light, bright = run.gaussians, run.light, earth if run.knows_earth else None
+    steps = SEEN_SIDE**2 + color_steps(light) + (sunlight_steps(gaussians, light, bright) if light else 0)
     done = 0
 
     def step() -> None:
@@ -61,7 +67,7 @@ def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth |
             report(done, steps)
 
     colors = tabulate_colors(gaussians, light, step)
-    sunlight = tabulate_sunlight(gaussians, light, step, earth) if light else None
+    sunlight = tabulate_sunlight(gaussians, light, step, bright) if light else None
     arrays = _shapes(gaussians) | {"colors": colors.coefficients, "color_table": colors.table}
     means = arrays["means"].astype(np.float64)
     centre = np.median(means, axis=0)
@@ -85,6 +91,8 @@ def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth |
         arrays["normals"] = _normals(gaussians, light.config.field.features)
     if run.curve:
         about["curve"] = {"tone": run.curve.tone, "white": run.curve.white}
+    if earth is not None:
+        about["earth"] = {"direction": earth.direction.tolist(), "radius": math.radians(earth.angular_radius_deg)}
     if sunlight is not None:
         _add_sunlight(sunlight, about, arrays)
     return about, arrays
@@ -118,16 +126,15 @@ def _add_sunlight(sunlight: SunlightTables, about: JsonDict, arrays: Arrays) -> 
         arrays["bounce"], arrays["bounce_table"] = sunlight.bounce, sunlight.bounce_table
 
 
-def _page(run: Run, about: JsonDict, arrays: Arrays) -> str:
+def _page(run: Run, name: str, about: JsonDict, arrays: Arrays) -> str:
     """The whole file."""
     packed, start, described = [], 0, []
-    for name, array in arrays.items():
+    for array_name, array in arrays.items():
         content = np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"))).tobytes()
-        described.append({"name": name, "type": array.dtype.name, "start": start, "length": array.size})
+        described.append({"name": array_name, "type": array.dtype.name, "start": start, "length": array.size})
         content += bytes(-len(content) % 4)
         start += len(content)
         packed.append(content)
-    name = run.path.resolve().name
     caption = f"{run.config['method']}, {about['count']:,} Gaussians, made by spacesim"
     metadata = json.dumps(about | {"arrays": described}, sort_keys=True).replace("<", "\\u003c")
     parts = {

@@ -12,6 +12,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.memory import check_memory
+from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.model import LightModel
@@ -66,7 +67,8 @@ def tabulate_sunlight(
         if more:
             arriving = np.zeros((count, 6), np.float32) if earth is None else _earthlight(gaussians, light, sun, earth)
             if sunlight.bounced:
-                arriving += np.stack([np.array(row) for row in sunlight.bounced], axis=1)
+                left = 1.0 if earth is None else earth.visible_sun(sun)
+                arriving += left * np.stack([np.array(row) for row in sunlight.bounced], axis=1)
             bounced[index // side // blocks, index % side // blocks] += albedo * arriving / blocks**2
         report()
     packed = np.ascontiguousarray((levels[0::2] | levels[1::2] << 4).T) if light.config.shadow else None
@@ -95,7 +97,7 @@ def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
 
 def _earthlight(gaussians: Gaussians, light: LightModel, sun: np.ndarray, earth: Earth) -> np.ndarray:
     """float32 [N, 6]: what arrives at the side of the normal and at the other, three times each."""
-    (beams,) = light.encode_sun(sun, earth).beams
+    beams = upload(earth.beams(sun))
     normals = ad.Array3f(_features(gaussians, light.config.field.features))
     sides = [np.array(earth_irradiance(normals, direction, beams)) for direction in (-normals, normals)]
     return np.repeat(np.stack(sides, axis=1), 3, axis=1)

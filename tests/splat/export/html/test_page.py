@@ -31,7 +31,7 @@ from spacesim.splat.run import Run, load_run
 from spacesim.splat.train.config import preset
 
 COUNT = 150
-EARTH = Earth([0.3, 0.2, -1.0], albedo=1.0)
+EARTH = Earth([0.3, 0.2, -1.0], 50.0, albedo=1.0)
 CLOSE = {"plain": 37, "relit": 29, "linear": 34, "directions": 30, "earthlit": 29}  #: dB at least
 
 
@@ -150,6 +150,21 @@ def test_the_earth_is_as_bright_as_in_render(runs, tabs):
     camera, sun = camera_at([0.2, -0.1, -4.0]), Sun.from_angles(30, 80)
     both, alone = (np.clip(runs["earthlit"].predict(camera, one).rgb, 0, 1) for one in (replace(sun, earth=EARTH), sun))
     assert psnr(alone, both) + 5 < psnr(drawn(tabs["earthlit"], camera, sun), both)
+
+
+def test_the_earth_hides_the_sun_as_in_render(runs, tabs):
+    camera, limb = camera_at([0.2, -0.1, 4.0]), np.radians(EARTH.angular_radius_deg)
+    side = np.cross(EARTH.direction, [0, 1, 0]) / np.linalg.norm(np.cross(EARTH.direction, [0, 1, 0]))
+    shares = []
+    for radii in (-2.0, -0.5, 0.3, 0.8):
+        angle = limb + radii * 0.00465
+        sun = Sun(np.cos(angle) * EARTH.direction + np.sin(angle) * side, EARTH)
+        shares.append(sun.visible_share)
+        for name in ("relit", "earthlit"):
+            rendered = np.clip(runs[name].predict(camera, sun).rgb, 0, 1)
+            tabs[name].send("Page.bringToFront")
+            assert psnr(drawn(tabs[name], camera, sun), rendered) > 25, (name, radii)
+    assert shares[0] == 0 < shares[1] < 0.3 < 0.6 < shares[2] < 0.8 < shares[3] < 1
 
 
 def test_a_large_splat_near_the_eye_is_cut_as_in_render(runs, tabs):
@@ -294,7 +309,7 @@ def test_what_is_hidden_is_not_drawn_but_from_within(relit):
 
 def test_the_same_run_gives_the_same_bytes(runs, pages, tmp_path):
     reported: list[tuple[int, int]] = []
-    write_page(runs["relit"], tmp_path / "again.html", lambda *done: reported.append(done))
+    write_page(runs["relit"], tmp_path / "again.html", lambda *done: reported.append(done), EARTH)
     assert (tmp_path / "again.html").read_bytes() == pages["relit"].read_bytes()
     assert reported[-1][0] == reported[-1][1] == len(reported)
 
