@@ -137,6 +137,21 @@ def test_a_camera_in_the_mirrored_pose_of_a_flat_object_is_begun_anew():
     assert np.linalg.norm(found.positions[20] - true[20]) < 0.1
 
 
+@pytest.mark.parametrize("count", [3, 4, 5, 12])
+def test_few_pictures_and_features_that_say_nothing_end_as_they_were(count):
+    model, features = filmed(arc(count))
+    times = np.arange(float(count))
+    assert begun_anew(model, features, times, SOFT) is model
+    bare = features.pictures != 1
+    without = Features(features.pictures[bare], features.points[bare], features.pixels[bare])
+    assert begun_anew(model, without, times, SOFT) is model
+    broken = replace(features, pixels=np.where(features.points[:, None] == 3, np.nan, features.pixels))
+    assert begun_anew(model, broken, times, SOFT) is model
+    still = replace(model, world_from_camera=np.repeat(model.world_from_camera[:1], count, axis=0))
+    assert np.isfinite(begun_anew(still, features, times, SOFT).positions).all()
+    assert not is_smooth(filmed(arc(5))[0], filmed(arc(5))[1], np.arange(5.0), SOFT)
+
+
 def test_a_smooth_film_is_better_on_its_path_and_its_cut_stays():
     times, positions = film_path(0.0, 0)
     model, features = filmed(positions)

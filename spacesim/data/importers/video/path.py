@@ -25,6 +25,7 @@ _SAMPLES = 60  # departures, of which these are computed
 _BESIDE = 4  # pictures of a film before and after one, by which its place is told
 _STRAY = 6.0  # times what the film's camera departs in the median, and its neighbours here
 _LEAST_STRAY = 0.005  # of the distance
+_LEAST_FEATURES = 6  # by which a camera is begun anew
 _ELSEWHERE = 0.001  # of the distance: a camera that is so far off stands in another optimum
 _NEARLY = 1.1  # times the cost of a camera's features, with which another optimum may begin
 _STEPS, _ENOUGH = 30, 1e-5  # at most; share of the cost by which a step must lower it
@@ -63,6 +64,7 @@ def begun_anew(model: SfmModel, features: Features, times: Array, soft: float) -
     return found
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane
 def _has_other_pose(model: SfmModel, features: Features, times: Array, soft: float, k: int, poses: Array) -> bool:
     """Whether a camera has another pose that its features explain nearly as well; it is written to poses[k]."""
     shown = np.flatnonzero(features.pictures == k)
@@ -83,10 +85,12 @@ def _has_other_pose(model: SfmModel, features: Features, times: Array, soft: flo
         off = lens.off(rotations, positions, model.points)[0]
         return float(np.log1p(np.square(off).sum(axis=1) / soft**2).sum())
 
-    found = least_squares(
-        lambda step: lens.off(*pose(step), model.points)[0].ravel(), np.zeros(6), loss="cauchy", f_scale=soft
-    )
-    turned, placed = pose(found.x)
+    def residuals(step: Array) -> Array:
+        return lens.off(*pose(step), model.points)[0].ravel()
+
+    if len(shown) < _LEAST_FEATURES or not np.isfinite(residuals(np.zeros(6))).all():
+        return False
+    turned, placed = pose(least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=soft).x)
     is_other = np.linalg.norm(placed[0] - poses[k, :3, 3]) > _ELSEWHERE * distance
     if is_other and cost(turned, placed) < _NEARLY * cost(poses[k : k + 1, :3, :3], poses[k : k + 1, :3, 3]):
         poses[k, :3, :3], poses[k, :3, 3] = turned[0], placed[0]
