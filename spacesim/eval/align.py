@@ -84,20 +84,24 @@ def align(own: Dataset, truth: Dataset) -> Alignment:
         )
     places = [np.array([pair[side].camera.world_from_camera for pair in matches]) for side in (0, 1)]
     pose, is_inlier = robust_similarity(*places)
-    away, turns = residuals(pose, *places)
     distance = float(np.median(np.linalg.norm(places[1][:, :3, 3] - target_of(truth), axis=1)))
-    rms = float(np.sqrt(np.square(away[is_inlier]).mean()))
+    rms, turns = _off(pose, places, is_inlier)
+    if rms < TOO_FAR * distance and own.ply_file_path is not None:
+        pose = seen_alike(pose, matches, read_points(own.root / own.ply_file_path)[0])
+        rms, turns = _off(pose, places, is_inlier)
     if rms > TOO_FAR * distance or 2 * is_inlier.sum() < len(matches):
         raise InputError(
             f"{own.root}: expected cameras like those of {truth.root}, found {is_inlier.sum()} of {len(matches)} "
             f"within {100 * rms / distance:.0f} % of the distance (matched by {words}; a mirrored model never fits)"
         )
-    if own.ply_file_path is not None:
-        pose = seen_alike(pose, matches, read_points(own.root / own.ply_file_path)[0])
-        away, turns = residuals(pose, *places)
-        rms = float(np.sqrt(np.square(away[is_inlier]).mean()))
     turn = float(np.sqrt(np.square(turns[is_inlier]).mean()))
     return Alignment(pose, words, len(matches), int(is_inlier.sum()), rms, max(distance, 1e-12), turn)
+
+
+def _off(pose: Pose, places: list[Array], is_inlier: np.ndarray) -> tuple[float, Array]:
+    """(RMS of the inliers' positions, degrees that each camera is turned)."""
+    away, turns = residuals(pose, *places)
+    return float(np.sqrt(np.square(away[is_inlier]).mean())), turns
 
 
 def as_trained(own: Dataset, run: Path) -> Dataset:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import spacesim.eval.align as align_module
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, rotation_from_quaternion
 from spacesim.data.identity import training_digest
@@ -139,6 +140,17 @@ def test_a_mirrored_reconstruction_is_refused(truth, tmp_path):
         frames.append(replace(frame, camera=replace(frame.camera, world_from_camera=place)))
     with pytest.raises(InputError, match="expected cameras like those of"):
         align(Dataset(tmp_path / "own", tuple(frames), ()), truth)
+
+
+def test_what_points_move_too_far_is_refused(truth, tmp_path, monkeypatch):
+    own = replace(reconstruction(truth, tmp_path / "own"), ply_file_path="points.ply")
+    own.root.mkdir()
+    write_points(own.root / "points.ply", INSIDE.points(fibonacci_sphere(40)), np.zeros((40, 3), np.uint8))
+    same_pose(align(own, truth).pose, POSE, 1e-6)
+    away = Pose(np.eye(3), np.array([3.0, 0.0, 0.0])).after(POSE)
+    monkeypatch.setattr(align_module, "seen_alike", lambda *_: away)
+    with pytest.raises(InputError, match=r"expected cameras like those of .*, found 15 of 15 within 50 %"):
+        align(own, truth)
 
 
 def test_frames_without_a_partner_are_refused(truth, tmp_path):

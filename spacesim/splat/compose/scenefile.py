@@ -61,7 +61,7 @@ def load_scene(
         where = document.label(("earth",))
         raise InputError(f"{where}: expected a model that the Sun relights, found none")
     if earth and (without := [model.name for model in models if not model.run.knows_earth]):
-        log.info("%s: has not learned the Earth's light and is drawn without it", ", ".join(without))
+        log.info("%s: has not learned the Earth's light; it can but hide the Sun", ", ".join(without))
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps, earth)
 
 

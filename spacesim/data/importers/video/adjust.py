@@ -16,8 +16,8 @@ INSTALL = "pip install 'spacesim[sfm]'"
 _SOFT, _SOFT_SIDE = 0.3, 960  # pixels from which on a feature pulls less, as highlights move; on a longer side of so
 # many and less, on a longer one as many more
 _ENOUGH = 0.9  # share of pictures with a pose, from which on a lens without distortion will do
-_BETTER = 0.95  # share of the error that may be left, for distortion or another focal length to be believed
-_OTHER_FOV = 1.03  # times the one that was given: such a one is another
+_BETTER = 0.95  # share of the error that may be left, for distortion to be believed, or a focal length to be in doubt
+_OTHER_FOV, _BETTER_FOV = 1.1, 0.97  # times the one that was given, and the share of the error left with it: another
 _OTHER_FOCAL = 1.15  # times the focal length: such a one must fit worse
 
 _log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ def doubt_given(colmap: ModuleType, found: Any, distorted: bool) -> None:
     given, better = adjust(colmap, found, False, distorted), adjust(colmap, free, True, distorted)
     cameras = [next(iter(one.cameras.values())) for one in (found, free)]
     angles = [_degrees(camera.width, camera.params[0]) for camera in cameras]
-    if better < _BETTER * given and max(angles) > _OTHER_FOV * min(angles):
+    if better < _BETTER_FOV * given and max(angles) > _OTHER_FOV * min(angles):
         _log.warning(
             "fov: the pictures fit better with %.3g degrees than with %.3g as given (%.3g instead of %.3g pixels off)",
             angles[1], angles[0], better, given,

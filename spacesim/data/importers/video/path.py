@@ -47,30 +47,32 @@ def begun_anew(model: SfmModel, features: Features, times: Array, soft: float) -
 
     Of a flat object, or one seen from ahead, two poses explain a picture nearly as well (G. Schweighofer, A. Pinz,
     "Robust pose estimation from a planar target", 2006). Each camera is begun anew between those before and after it
-    and adjusted to its features. Where that leads elsewhere at nearly no more cost, it stays there, and all is adjusted
-    to features; if their cost then falls, this is the model, else the one that was given.
+    and adjusted to its features. Where that leads elsewhere at nearly no more cost, all is adjusted to features from
+    there; it stays if their cost falls.
 
     model: adjusted to the features with Cauchy's cost; others: as for `on_path`
     """
-    poses = model.world_from_camera.copy()
-    others = [k for k in range(1, len(poses) - 1) if _has_other_pose(model, features, times, soft, k, poses)]
-    if not others:
-        return model
-    problem = _Problem(model, features, times, soft, np.inf)
-    found = _adjusted(replace(model, world_from_camera=poses), problem)
-    if not problem.cost(*_state(found)) < problem.cost(*_state(model)):
-        return model
-    _log.info("begun anew between their neighbours: %s", ", ".join(model.names[k] for k in others))
-    return found
+    for k in range(1, len(model.names) - 1):
+        other = _other_pose(model, features, times, soft, k)
+        if other is None:
+            continue
+        poses = model.world_from_camera.copy()
+        poses[k] = other
+        problem = _Problem(model, features, times, soft, np.inf)
+        found, same = (_adjusted(one, problem) for one in (replace(model, world_from_camera=poses), model))
+        if problem.cost(*_state(found)) < problem.cost(*_state(same)):
+            _log.info("begun anew between its neighbours: %s", model.names[k])
+            model = found
+    return model
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of points in a camera's plane
-def _has_other_pose(model: SfmModel, features: Features, times: Array, soft: float, k: int, poses: Array) -> bool:
-    """Whether a camera has another pose that its features explain nearly as well; it is written to poses[k]."""
+def _other_pose(model: SfmModel, features: Features, times: Array, soft: float, k: int) -> Array | None:
+    """[4, 4] another pose of a camera that its features explain nearly as well, begun between its neighbours."""
     shown = np.flatnonzero(features.pictures == k)
     one = replace(model, names=model.names[k : k + 1], world_from_camera=model.world_from_camera[k : k + 1])
     own = Features(np.zeros(len(shown), int), features.points[shown], features.pixels[shown])
-    lens, distance = _Lens(one, own), np.linalg.norm(poses[k, :3, 3] - np.median(model.points, axis=0))
+    lens, distance = _Lens(one, own), np.linalg.norm(one.positions[0] - np.median(model.points, axis=0))
     share = (times[k] - times[k - 1]) / (times[k + 1] - times[k - 1])
     before, after = model.world_from_camera[[k - 1, k + 1]]
     turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
@@ -89,13 +91,14 @@ def _has_other_pose(model: SfmModel, features: Features, times: Array, soft: flo
         return lens.off(*pose(step), model.points)[0].ravel()
 
     if len(shown) < _LEAST_FEATURES or not np.isfinite(residuals(np.zeros(6))).all():
-        return False
+        return None
     turned, placed = pose(least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=soft).x)
-    is_other = np.linalg.norm(placed[0] - poses[k, :3, 3]) > _ELSEWHERE * distance
-    if is_other and cost(turned, placed) < _NEARLY * cost(poses[k : k + 1, :3, :3], poses[k : k + 1, :3, 3]):
-        poses[k, :3, :3], poses[k, :3, 3] = turned[0], placed[0]
-        return True
-    return False
+    is_other = np.linalg.norm(placed[0] - one.positions[0]) > _ELSEWHERE * distance
+    if not is_other or cost(turned, placed) > _NEARLY * cost(one.world_from_camera[:, :3, :3], one.positions):
+        return None
+    other = one.world_from_camera[0].copy()
+    other[:3, :3], other[:3, 3] = turned[0], placed[0]
+    return other
 
 
 def is_smooth(model: SfmModel, features: Features, times: Array, soft: float) -> bool:
