@@ -1,8 +1,8 @@
 """The cameras of a film put on a smooth path: bundle adjustment with how a camera moves beside what it sees.
 
 Features alone leave a film's cameras loose where all of an object is seen from ahead: its two halves then stand askew
-by half a degree, at no cost in pixels. A camera does not jump: of four pictures in a row the last is nearly where a
-parabola through the others would have it.
+by half a degree, at no cost in pixels. A camera that is not shaken does not jump: of four pictures in a row the last is
+nearly where a parabola through the others would have it.
 """
 
 import logging
@@ -102,8 +102,8 @@ def _other_pose(model: SfmModel, features: Features, times: Array, soft: float, 
 
 
 def is_smooth(model: SfmModel, features: Features, times: Array, soft: float) -> bool:
-    """Whether the cameras of a film depart from a smooth path by no more than errors of features explain, which are
-    taken for independent; False of fewer than twelve pictures.
+    """Whether the cameras of a film depart from a smooth path by no more, in the median, than twice what independent
+    errors of features explain; False of fewer than twelve pictures.
 
     model: adjusted to the features with Cauchy's cost; others: as for `on_path`
     """
