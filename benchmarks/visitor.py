@@ -27,6 +27,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from spacesim.data.geometry import look_at, quaternion_from_rotation
+from spacesim.viewer.panels.handles import HANDLES
 
 FOV = float(np.radians(35))
 STAY = 20.0  #: seconds until a client leaves and comes back
@@ -129,7 +130,7 @@ class Visitor:
         label = message.get("props", {}).get("label") if kind.startswith("Gui") else None
         if label is not None:
             self.controls[label] = message
-        elif kind == "SetPositionMessage" and message["name"].startswith("/models/"):
+        elif kind == "SetPositionMessage" and message["name"].startswith(f"{HANDLES}/models/"):
             self.handles.setdefault(message["name"], message["position"])
         elif kind in ("SetCameraPositionMessage", "SetCameraLookAtMessage") and message["initial"]:
             key = "position" if "position" in message else "look_at"

@@ -231,7 +231,7 @@ def camera(angle: float = 0.0, **changes: Any) -> dict[str, Any]:
 
 def move(x: float) -> dict[str, Any]:
     """What moves the first model."""
-    handle = {"type": "TransformControlsUpdateMessage", "name": "/models/0", "owner": ""}
+    handle = {"type": "TransformControlsUpdateMessage", "name": "/handles/models/0", "owner": ""}
     return {**handle, "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [x, 0.0, 0.0]}
 
 
