@@ -2,7 +2,6 @@
 
 import io
 import logging
-import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +30,15 @@ from spacesim.data.importers.masks import (
 )
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, arc_of, hull_length, placed, report_of, without_floating
+from spacesim.data.importers.video.model import (
+    SfmModel,
+    arc_of,
+    focal_length,
+    hull_length,
+    placed,
+    report_of,
+    without_floating,
+)
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import (
@@ -164,7 +171,7 @@ def _import(
     it besides; times: of a film's, see `reconstruct`"""
     names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
-    focal = None if settings.fov is None else 0.5 * width / math.tan(math.radians(0.5 * settings.fov))
+    focal = None if settings.fov is None else focal_length(width, settings.fov)
     if focal is not None:
         check_focal(focal, (width, height), "fov")
     has_masks = _find_masks(folder, names, settings, tell)
