@@ -106,8 +106,7 @@ def import_video(
                 f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
                 "nothing moves"
             )
-        keys: dict[str, dict[str, JsonValue]] = {}
-        seconds: list[float | None] = []
+        keys: dict[str, dict[str, float]] = {}
         size: tuple[int, ...] | None = None
         for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
@@ -116,16 +115,16 @@ def import_video(
                     raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
                 name = f"frame_{number:06d}.png"
                 write_png(folder / "pictures" / name, _scaled(frame.picture, settings.height), durable=False)
-                seconds.append(frame.time)
                 keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
         facts: dict[str, JsonValue] = {"frames_of_video": len(seen.motion)}
-        return _import(src, out, folder, keys, _times(seconds, chosen.tolist()), settings, source, tell, facts)
+        return _import(src, out, folder, keys, _times(list(keys.values())), settings, source, tell, facts)
 
 
-def _times(seconds: Sequence[float | None], numbers: Sequence[float]) -> Sequence[float]:
+def _times(keys: Sequence[Mapping[str, float]]) -> list[float]:
     """Of a film's frames: seconds, or frame numbers where seconds are missing or do not rise."""
-    known = [one for one in seconds if one is not None]
-    return known if len(known) == len(numbers) and (np.diff(known) > 0).all() else numbers
+    seconds = [one["time"] for one in keys if "time" in one]
+    rise = len(seconds) == len(keys) and (np.diff(seconds) > 0).all()
+    return seconds if rise else [one["source_index"] for one in keys]
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:
