@@ -37,7 +37,7 @@ from spacesim.eval.frame_metrics import (
     write_pictures,
 )
 from spacesim.eval.labels import GROUPS, SHADOW
-from spacesim.eval.material import compare_materials
+from spacesim.eval.material import MaterialComparison
 from spacesim.eval.metrics import grazing, lpips, material, shadow
 from spacesim.eval.metrics.geometry import GeometryConfig, ShapeResult, compare_geometry
 from spacesim.eval.notes import (
@@ -129,14 +129,17 @@ def evaluate(
         trained = [moved_frame(frame, alignment.pose) for frame in trained]
     objects = object_names(dataset, models or ())
     knows_sun = known_suns(frames, trained)
+    comparison = MaterialComparison(run, dataset, frames)
     results: list[FrameResult] = []
     for name, frame, has_known_sun in zip(frame_names(frames), frames, knows_sun, strict=True):
         if progress:
             progress(len(results), len(frames), frame.file_path)
         folder = out / "frames" / name
-        results.append(_evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns))
+        results.append(
+            _evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns, comparison)
+        )
     folders = [out / "frames" / result.record["name"] for result in results]
-    materials = compare_materials(run, dataset, frames, folders)
+    materials = comparison.scores(folders)
     for result, values in zip(results, materials.records, strict=True):
         result.record["material"] = values
     no_map = _write_camera_density(dataset, trained, out)
@@ -243,9 +246,10 @@ def _evaluate_frame(
     folder: Path,
     objects: Mapping[int, str],
     unknowns: Sequence[Unknown],
+    comparison: MaterialComparison,
 ) -> FrameResult:
     """Predict a frame, what is not known of it fitted by halves, evaluate it and each of its `objects`, write its
-    pictures into `folder`."""
+    pictures into `folder`, and add it to the `comparison`."""
     fitted = None
     if unknowns:
         fit = predict_by_halves(run, dataset, frame, unknowns)
@@ -256,6 +260,7 @@ def _evaluate_frame(
         seconds = time.perf_counter() - start
     light = frame_light(dataset, frame, prediction)
     view, source = frame_images(dataset, frame, prediction, light.truth)
+    comparison.add(frame, light.truth, view.valid)
     photograph = is_photograph(frame, source)
     ignored = float(1 - view.valid.mean())
     write_pictures(folder, view, light, photograph)

@@ -36,41 +36,51 @@ class MaterialScores:
     notes: list[str]  #: why there is none
 
 
-def compare_materials(
-    run: "Predictor", dataset: Dataset, frames: Sequence[Frame], folders: Sequence[Path]
-) -> MaterialScores:
-    """Over the pixels whose centre shows an object. One scale for all frames, so these are drawn twice: for the scale,
-    then for errors and pictures, into the frames' `folders`."""
-    traced = [frame for frame in frames if frame.gt_path is not None]
-    if not traced:
-        return MaterialScores([None] * len(frames), None, ["material is null: the data has no path-traced truth."])
-    why = _why_no_albedo(run, traced[0].camera)
-    gaussians, records, sums = run.gaussians, list[Metrics | None](), list[AlbedoSums]()
-    for frame in frames:
-        if frame.gt_path is None:
-            records.append(None)
-            continue
-        truth, mask = _truth(dataset, frame)
+class MaterialComparison:
+    """Frame after frame, over the pixels whose centre shows an object. One scale for all frames: where there is albedo
+    these are read and drawn again in the end, for errors and pictures."""
+
+    def __init__(self, run: "Predictor", dataset: Dataset, frames: Sequence[Frame]) -> None:
+        self._run, self._dataset, self._frames = run, dataset, frames
+        traced = [frame for frame in frames if frame.gt_path is not None]
+        self._notes = ["material is null: the data has no path-traced truth."]
+        if traced:
+            why = _why_no_albedo(run, traced[0].camera)
+            self._notes = [f"albedo_error is null: {why}."] if why else []
+        self._records: list[Metrics | None] = []
+        self._sums: list[AlbedoSums] = []
+
+    def add(self, frame: Frame, truth: Truth | None, valid: Mask) -> None:
+        """The next of the frames. truth: None where it has none;  valid: [H, W] bool, pixels that are not to be
+        ignored"""
+        if truth is None:
+            self._records.append(None)
+            return
+        mask, gaussians = _shown(truth, valid), self._run.gaussians
         record: Metrics = dict.fromkeys(("albedo_error", "normals_deg", "learned_normals_deg"))
         if gaussians is not None:
-            drawn = render(gaussians, Pinhole.of(frame.camera), outputs=("normal",), antialiased=run.antialiased)
+            drawn = render(gaussians, Pinhole.of(frame.camera), outputs=("normal",), antialiased=self._run.antialiased)
             record["normals_deg"] = material.normals_deg(drawn.image("normal"), truth.normal, mask)
-        if not why:
-            view = run.draw_material(frame.camera)
+        if not self._notes:
+            view = self._run.draw_material(frame.camera)
             record["learned_normals_deg"] = material.normals_deg(view.normal, truth.normal, mask)
-            sums.append(AlbedoSums.of(view.albedo, truth.albedo, mask))
-        records.append({**record, "pixels": int(mask.sum())})
-    total = AlbedoSums.total(sums)
-    scale = total.scale
-    if scale is not None:
-        mean = total.true / total.values
-        for frame, record_of_frame, folder in zip(frames, records, folders, strict=True):
-            if record_of_frame is not None:
-                truth, mask = _truth(dataset, frame)
-                view = run.draw_material(frame.camera)
-                record_of_frame["albedo_error"] = material.albedo_error(view.albedo, truth.albedo, mask, scale, mean)
-                _write_pictures(folder, view, truth, scale)
-    return MaterialScores(records, scale, [f"albedo_error is null: {why}."] if why else [])
+            self._sums.append(AlbedoSums.of(view.albedo, truth.albedo, mask))
+        self._records.append({**record, "pixels": int(mask.sum())})
+
+    def scores(self, folders: Sequence[Path]) -> MaterialScores:
+        """Of all frames, once these are added, with pictures in their `folders`."""
+        total = AlbedoSums.total(self._sums)
+        scale = total.scale
+        if scale is not None:
+            mean = total.true / total.values
+            for frame, record, folder in zip(self._frames, self._records, folders, strict=True):
+                if record is not None:
+                    truth = load_truth(self._dataset, frame)
+                    mask = _shown(truth, load_image(self._dataset, frame).valid)
+                    view = self._run.draw_material(frame.camera)
+                    record["albedo_error"] = material.albedo_error(view.albedo, truth.albedo, mask, scale, mean)
+                    _write_pictures(folder, view, truth, scale)
+        return MaterialScores(self._records, scale, self._notes)
 
 
 def _why_no_albedo(run: "Predictor", camera: Camera) -> str:
@@ -82,10 +92,9 @@ def _why_no_albedo(run: "Predictor", camera: Camera) -> str:
     return ""
 
 
-def _truth(dataset: Dataset, frame: Frame) -> tuple[Truth, Mask]:
-    """A frame's truth, and [H, W] bool which pixels show an object and are not to be ignored."""
-    truth = load_truth(dataset, frame)
-    return truth, (truth.object_id > 0) & load_image(dataset, frame).valid
+def _shown(truth: Truth, valid: Mask) -> Mask:
+    mask: Mask = (truth.object_id > 0) & valid
+    return mask
 
 
 def _write_pictures(folder: Path, view: "MaterialView", truth: Truth, scale: float) -> None:

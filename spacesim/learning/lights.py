@@ -33,15 +33,17 @@ class CanPredict(Protocol):
 
     @property
     def knows_earth(self) -> bool:
-        """Whether the light of a Sun's Earth changes what is predicted."""
+        """Whether the light of a Sun's Earth changes what is predicted: it has learned it (`light.earth`)."""
 
     def predict(
         self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
     ) -> Prediction:
-        """Render one view; see `spacesim.splat.run.Predictor`."""
+        """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
+        the training pictures. Raises InputError where the Sun matters and none is given, and for an exposure of colours
+        that are sRGB values."""
 
     def draw_material(self, camera: Camera) -> MaterialView:
-        """Materials in one view; see `spacesim.splat.run.Predictor`."""
+        """What one view shows of the materials that can be read out of a model. Raises InputError where none can."""
 
 
 def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | None = None) -> tuple[Sun | None, Light]:

@@ -24,7 +24,7 @@ from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Sun
 from spacesim.data.structure import checked, read_record
 from spacesim.learning.folder import finished_model, read_described
-from spacesim.learning.lights import Light
+from spacesim.learning.lights import CanPredict, Light
 from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
@@ -63,9 +63,9 @@ class ComposedModel(Protocol):
         """Whether it is drawn with the anti-aliasing filter."""
 
 
-class Predictor(Protocol):
-    """What evaluating, sweeping and showing ask for: a trained `Run`, or several in one scene (`ComposedRun`),
-    or a radiance field (`nerf.run.NerfRun`)."""
+class Predictor(CanPredict, Protocol):
+    """What evaluating, sweeping and showing ask for beside predictions: a trained `Run`, or several in one scene
+    (`ComposedRun`), or a radiance field (`nerf.run.NerfRun`)."""
 
     @property
     def path(self) -> Path:
@@ -100,14 +100,6 @@ class Predictor(Protocol):
         """Whether Gaussians are drawn with the anti-aliasing filter: one bool for all, or Bool [N]."""
 
     @property
-    def relightable(self) -> bool:
-        """Whether the Sun's direction changes what is predicted."""
-
-    @property
-    def knows_earth(self) -> bool:
-        """Whether the light of a Sun's Earth changes what is predicted: it has learned it (`light.earth`)."""
-
-    @property
     def has_shadows(self) -> bool:
         """Whether what it predicts has a visibility of the Sun."""
 
@@ -122,16 +114,6 @@ class Predictor(Protocol):
     def with_embedding(self, embedding: np.ndarray) -> "Predictor":
         """The same with every view drawn with `embedding` [E]. Raises InputError where no picture of training has
         one."""
-
-    def predict(
-        self, camera: Camera, sun: Sun | None = None, normals: bool = False, exposure: float | None = None
-    ) -> Prediction:
-        """Render one view. normals: predict these, too;  exposure: EV, of colours that are linear; by default that of
-        the training pictures. Raises InputError where the Sun matters and none is given, and for an exposure of colours
-        that are sRGB values."""
-
-    def draw_material(self, camera: Camera) -> MaterialView:
-        """What one view shows of the materials that can be read out of a model. Raises InputError where none can."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,14 @@
 
 import io
 import threading
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from spacesim.data.geometry import quaternion_from_rotation
+from spacesim.data.geometry import Array, quaternion_from_rotation
 from spacesim.data.records import Camera, Dataset
 from spacesim.viewer.drawing.frames import draw_mode
 from spacesim.viewer.drawing.loop import RenderLoop
@@ -27,6 +27,16 @@ if TYPE_CHECKING:
 
 QUALITY, QUALITY_AT_REST = 75, 95  #: of JPEG
 MAX_PICTURE_SIDE = 4096  #: pixels a side of a picture that is saved
+
+
+@dataclass(frozen=True, eq=False)
+class _FirstView:
+    """What a browser shows until its camera is moved."""
+
+    place: Array  #: [3] metres
+    fov: float  #: vertical, radians, of a window that is no higher than wide
+    #: those of the window as it has been; none before it is at the place, as browsers report another at first
+    shown: set[float] = field(default_factory=set)
 
 
 class Client:
@@ -51,9 +61,7 @@ class Client:
         self._sun = sun
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._handles = handle.scene.add_frame(HANDLES, show_axes=False)
-        self._first_fovs: list[float] = []  # vertical fields of view of the first place, the server's first
-        self._first_place = np.zeros(3)
-        self._is_begun = False  # at the first place; before, browsers report another
+        self._first: _FirstView | None = None
         self._lock = threading.Lock()
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
@@ -62,7 +70,7 @@ class Client:
 
     def begin(self, place: ArrayLike, fov: float) -> None:
         """Draw for it from now on. place, fov: [3] metres and vertical, radians, where it looks from at first"""
-        self._first_place, self._first_fovs = np.array(place), [fov]
+        self._first = _FirstView(np.array(place), fov)
         self.handle.camera.on_update(self._moved)
         self._on_camera(self.handle.camera)
 
@@ -127,7 +135,7 @@ class Client:
         place = world_from_camera[:3, 3]
         centre = self._renderer.bounds(self._shared.state)[0]
         ahead = max(float((centre - place) @ world_from_camera[:3, 2]), 1e-3)
-        self._first_fovs = []
+        self._first = None
         with self.handle.atomic():
             camera.position = tuple(place)
             camera.look_at = tuple(place + ahead * world_from_camera[:3, 2])
@@ -161,17 +169,17 @@ class Client:
     def _widen_first(self, view: ViewerCamera) -> None:
         """Until it is moved, a window that is higher than wide, as beside a docked panel, shows the width of what a
         square one does."""
-        if not self._first_fovs:
+        first = self._first
+        if first is None:
             return
-        is_there = np.allclose(view.world_from_camera[:3, 3], self._first_place, rtol=1e-4)
-        if not is_there or not np.isclose(view.fov, self._first_fovs, rtol=1e-4).any():
-            if self._is_begun:
-                self._first_fovs = []
+        is_there = np.allclose(view.world_from_camera[:3, 3], first.place, rtol=1e-4)
+        if not is_there or not np.isclose(view.fov, [first.fov, *first.shown], rtol=1e-4).any():
+            if first.shown:
+                self._first = None
             return
-        self._is_begun = True
-        fov = float(2 * np.arctan(np.tan(0.5 * self._first_fovs[0]) * max(view.height / view.width, 1.0)))
+        fov = float(2 * np.arctan(np.tan(0.5 * first.fov) * max(view.height / view.width, 1.0)))
+        first.shown.add(fov)
         if not np.isclose(view.fov, fov, rtol=1e-4):
-            self._first_fovs.append(fov)
             self.handle.camera.fov = fov
 
 

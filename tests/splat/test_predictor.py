@@ -58,7 +58,7 @@ def test_predict_is_asked_in_the_same_words(kind):
     ],
 )
 def test_all_that_is_asked_for_is_there(kind, protocol):
-    asked = {name for name in vars(protocol) if not name.startswith("_")}
+    asked = {name for base in protocol.__mro__ for name in vars(base) if not name.startswith("_")}
     assert len(asked) > 3
     assert asked <= {*dir(kind), *kind.__dataclass_fields__}
 

@@ -18,7 +18,7 @@ from spacesim.learning.folder import TrainingProgress, check_folder, describe_da
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.pictures.poses import pose_config
+from spacesim.splat.train.pictures.poses import pose_config, pose_warning
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
 from spacesim.splat.train.start import distance_warning, scale_warning, sun_warning
 from spacesim.splat.train.trainer import Trainer
@@ -99,6 +99,8 @@ def _trainer_of_poses(
         first = Trainer(dataset, learning, suns)
         write_json(folder / "config.json", described)
         log.info("learning the poses of %d pictures, %d iterations", len(dataset.train), learning.iterations)
+        if remark := pose_warning(len(dataset.train), learning):
+            log.warning(remark)
         first.complete(folder, on_progress)
         assert first.pictures.poses is not None
         write_tensors(path, {"values": first.pictures.poses.numbers.values}, {})

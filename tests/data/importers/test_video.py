@@ -321,9 +321,14 @@ def test_poses_of_pictures_are_found(tmp_path):
 
 def test_a_films_times_are_its_seconds_where_they_rise():
     """A frame number is no time where the rate varies."""
-    assert importing._times([0.0, 0.04, 0.2], [0, 1, 5]) == [0.0, 0.04, 0.2]
+
+    def times(seconds):
+        frames = zip((0, 1, 5), seconds, strict=True)
+        return importing._times([{"source_index": k} | ({} if one is None else {"time": one}) for k, one in frames])
+
+    assert times([0.0, 0.04, 0.2]) == [0.0, 0.04, 0.2]
     for seconds in ([0.0, None, 0.2], [0.0, 0.2, 0.2], [0.1, 0.0, 0.2]):
-        assert importing._times(seconds, [0, 1, 5]) == [0, 1, 5]
+        assert times(seconds) == [0, 1, 5]
 
 
 @needs_colmap

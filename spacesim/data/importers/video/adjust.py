@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.importers.video.model import SfmModel
+from spacesim.data.importers.video.model import SfmModel, field_of_view
 
 INSTALL = "pip install 'spacesim[sfm]'"
 _SOFT, _SOFT_SIDE = 0.3, 960  # pixels from which on a feature pulls less, as highlights move; on a longer side of so
@@ -115,7 +115,7 @@ def doubt_focal(colmap: ModuleType, found: Any, model: SfmModel, distorted: bool
         errors.append(adjust(colmap, other, False, distorted))
     error = float(np.median(model.errors))
     if min(errors) * _BETTER < error:
-        wide = _degrees(model.width, model.focal)
+        wide = field_of_view(model.width, model.focal)
         _log.warning(
             "the field of view, estimated as %.3g degrees, is uncertain: a focal length %.0f %% %s fits nearly as well "
             "(%.3g instead of %.3g pixels off); name it with fov",
@@ -128,13 +128,9 @@ def doubt_given(colmap: ModuleType, found: Any, distorted: bool) -> None:
     free = colmap.Reconstruction(found)
     given, better = adjust(colmap, found, False, distorted), adjust(colmap, free, True, distorted)
     cameras = [next(iter(one.cameras.values())) for one in (found, free)]
-    angles = [_degrees(camera.width, camera.params[0]) for camera in cameras]
+    angles = [field_of_view(camera.width, camera.params[0]) for camera in cameras]
     if better < _BETTER_FOV * given and max(angles) > _OTHER_FOV * min(angles):
         _log.warning(
             "fov: the pictures fit better with %.3g degrees than with %.3g as given (%.3g instead of %.3g pixels off)",
             angles[1], angles[0], better, given,
         )  # fmt: skip
-
-
-def _degrees(width: int, focal: float) -> float:
-    return float(2 * np.degrees(np.arctan(0.5 * width / focal)))

@@ -2,7 +2,6 @@
 
 import io
 import logging
-import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +30,15 @@ from spacesim.data.importers.masks import (
 )
 from spacesim.data.importers.video.chart import draw_cameras
 from spacesim.data.importers.video.frames import choose, read_frames, survey
-from spacesim.data.importers.video.model import SfmModel, arc_of, hull_length, placed, report_of, without_floating
+from spacesim.data.importers.video.model import (
+    SfmModel,
+    arc_of,
+    focal_length,
+    hull_length,
+    placed,
+    report_of,
+    without_floating,
+)
 from spacesim.data.importers.video.segmentation import segment_sequence
 from spacesim.data.importers.video.sfm import check_focal, reconstruct
 from spacesim.data.importers.writing import (
@@ -99,8 +106,7 @@ def import_video(
                 f"{src}: expected at least {LEAST} frames that differ, found {len(chosen)} of {len(seen.motion)}: "
                 "nothing moves"
             )
-        keys: dict[str, dict[str, JsonValue]] = {}
-        seconds: list[float | None] = []
+        keys: dict[str, dict[str, float]] = {}
         size: tuple[int, ...] | None = None
         for number, frame in enumerate(read_frames(src, again=True)):
             if number in set(chosen.tolist()):
@@ -109,16 +115,16 @@ def import_video(
                     raise InputError(f"{src}: expected pictures of one size, found another from frame {number} on")
                 name = f"frame_{number:06d}.png"
                 write_png(folder / "pictures" / name, _scaled(frame.picture, settings.height), durable=False)
-                seconds.append(frame.time)
                 keys[name] = {"source_index": number} | ({} if frame.time is None else {"time": frame.time})
         facts: dict[str, JsonValue] = {"frames_of_video": len(seen.motion)}
-        return _import(src, out, folder, keys, _times(seconds, chosen.tolist()), settings, source, tell, facts)
+        return _import(src, out, folder, keys, _times(list(keys.values())), settings, source, tell, facts)
 
 
-def _times(seconds: Sequence[float | None], numbers: Sequence[float]) -> Sequence[float]:
+def _times(keys: Sequence[Mapping[str, float]]) -> list[float]:
     """Of a film's frames: seconds, or frame numbers where seconds are missing or do not rise."""
-    known = [one for one in seconds if one is not None]
-    return known if len(known) == len(numbers) and (np.diff(known) > 0).all() else numbers
+    seconds = [one["time"] for one in keys if "time" in one]
+    rise = len(seconds) == len(keys) and (np.diff(seconds) > 0).all()
+    return seconds if rise else [one["source_index"] for one in keys]
 
 
 def import_images(src: Path, out: Path, *, progress: Progress | None = None, **options: Any) -> Dataset:
@@ -164,7 +170,7 @@ def _import(
     it besides; times: of a film's, see `reconstruct`"""
     names = list(keys)
     width, height = Image.open(folder / "pictures" / names[0]).size
-    focal = None if settings.fov is None else 0.5 * width / math.tan(math.radians(0.5 * settings.fov))
+    focal = None if settings.fov is None else focal_length(width, settings.fov)
     if focal is not None:
         check_focal(focal, (width, height), "fov")
     has_masks = _find_masks(folder, names, settings, tell)

@@ -173,6 +173,16 @@ def median_angle(model: SfmModel) -> float:
     return float(np.median(angles))
 
 
+def focal_length(width: int, fov: float) -> float:
+    """Pixels, of pictures so many pixels wide whose width covers `fov` degrees."""
+    return 0.5 * width / math.tan(math.radians(0.5 * fov))
+
+
+def field_of_view(width: int, focal: float) -> float:
+    """The inverse of `focal_length`: degrees."""
+    return float(2 * np.degrees(np.arctan(0.5 * width / focal)))
+
+
 def arc_of(model: SfmModel) -> float:
     """Degrees between the two cameras that lie farthest apart as the origin sees them, at most 180."""
     towards = normalize(model.positions)

@@ -52,17 +52,21 @@ def begun_anew(model: SfmModel, features: Features, times: Array, soft: float) -
 
     model: adjusted to the features with Cauchy's cost; others: as for `on_path`
     """
+    problem: _Problem | None = None  # of the model, and what it costs once adjusted
+    least = np.inf
     for k in range(1, len(model.names) - 1):
         other = _other_pose(model, features, times, soft, k)
         if other is None:
             continue
+        if problem is None:
+            problem = _Problem(model, features, times, soft, np.inf)
+            least = problem.cost(*_state(_adjusted(model, problem)))
         poses = model.world_from_camera.copy()
         poses[k] = other
-        problem = _Problem(model, features, times, soft, np.inf)
-        found, same = (_adjusted(one, problem) for one in (replace(model, world_from_camera=poses), model))
-        if problem.cost(*_state(found)) < problem.cost(*_state(same)):
+        found = _adjusted(replace(model, world_from_camera=poses), problem)
+        if problem.cost(*_state(found)) < least:
             _log.info("begun anew between its neighbours: %s", model.names[k])
-            model = found
+            model, problem = found, None
     return model
 
 

@@ -44,6 +44,9 @@ from spacesim.splat.train.start import known_points
 
 START, START_SHARE = 100, 0.025  #: steps that poses wait at most, until colours are rough, and share of the training
 ANCHORED, ANCHORED_SHARE = 16, 0.25  #: times that each picture is shown to a model that stays; most of the training
+#: times that each picture is shown, below which poses hardly get better: errors of 1 degree were 0.8 after 16 and 0.3
+#: to 0.6 after 32, of 3 degrees 2.9 after 16, 2.5 after 32, 0.9 after 64 (40 and 120 pictures of boxsat, 64 pixels)
+MANY_TIMES = 32
 SHIFTS_FIRST = 5  #: steps of a picture that move it alone: a turn before these would only blur what a shift mends
 GAUGE_EVERY = 50  #: steps
 BELIEVED = 3.0  #: times what cameras share that err apart from each other, root mean square
@@ -152,6 +155,17 @@ class PoseRefinement:
 def pose_config(config: TrainConfig) -> TrainConfig:
     """Of the training that learns poses, before the one of `config`."""
     return replace(config, antialiased=True)
+
+
+def pose_warning(pictures: int, config: TrainConfig) -> str:
+    """A sentence where training is far too short to find poses of so many pictures; "" where it is not."""
+    least = -(-MANY_TIMES * pictures // config.views_per_step)
+    if config.iterations >= least:
+        return ""
+    return (
+        f"refine_poses: expected {least} or more iterations for {pictures} training pictures, found "
+        f"{config.iterations}: each is shown fewer than {MANY_TIMES} times, and poses will hardly get better"
+    )
 
 
 def pose_gradient(

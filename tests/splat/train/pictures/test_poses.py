@@ -21,7 +21,14 @@ from spacesim.splat.run import read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.pictures.numbers import PictureNumbers
-from spacesim.splat.train.pictures.poses import WAYS, PoseRefinement, left_jacobian, pose_config
+from spacesim.splat.train.pictures.poses import (
+    MANY_TIMES,
+    WAYS,
+    PoseRefinement,
+    left_jacobian,
+    pose_config,
+    pose_warning,
+)
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
@@ -318,6 +325,17 @@ def test_poses_of_another_training_are_refused(small_dataset, tmp_path):
     write_json(tmp_path / "other" / "config.json", {})
     with pytest.raises(InputError, match=r"expected the poses of .* pictures, found others; delete it"):
         train(small_dataset, tmp_path / "other", CONFIG)
+
+
+def test_a_training_too_short_to_find_poses_says_so(small_dataset, tmp_path, caplog):
+    count = len(small_dataset.train)
+    train(small_dataset, tmp_path / "run", replace(CONFIG, iterations=3))
+    least = f"expected {MANY_TIMES * count} or more iterations for {count} training pictures, found"
+    assert [record.getMessage().count(least) for record in caplog.records if record.levelname == "WARNING"] == [1]
+    enough = replace(CONFIG, iterations=MANY_TIMES * count)
+    assert pose_warning(count, enough) == ""
+    assert pose_warning(count, replace(enough, iterations=enough.iterations - 1)) != ""
+    assert pose_warning(2 * count, replace(enough, views_per_step=2)) == ""
 
 
 def test_a_run_without_has_none(small_dataset, tmp_path):
