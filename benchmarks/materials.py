@@ -3,12 +3,11 @@
     python benchmarks/materials.py RUN [--data DATA]
 
 Over the pixels of test frames that show a part, where at least 20 do: the median of the roughness, the mean luminance
-of the albedo and of its specular share, beside the scene's. True gloss is a metal's albedo, 0.04 of a coat, 0 of a dull
-surface; true roughness is alpha of GGX, of parts that have a gloss. Rank correlations (Spearman's) are over parts.
+of the albedo and the share of metal, beside the scene's. True roughness is alpha of GGX, of parts that have a gloss.
+Rank correlations (Spearman's) are over parts; "told" is the share of pixels said to be what they are.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,9 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import luminance
 from spacesim.data.records import Dataset
 from spacesim.data.store import load_truth, read_dataset
-from spacesim.splat.material import draw_material
 from spacesim.splat.run import Run, load_run
 
 LEAST_PIXELS = 20
-COAT = 0.04  #: reflectance of a clear coat, n = 1.5, at normal incidence
 
 
 def main() -> None:
@@ -37,15 +34,14 @@ def main() -> None:
     run = load_run(options.run)
     dataset = read_dataset(options.data or Path(run.config["data"]["path"]))
     rows = parts(run, dataset)
-    dull = [row for row in rows if row["true gloss"] <= COAT]
     glossy = [row for row in rows if row["true roughness"] is not None]
     correlations = {
         "albedo": rank(rows, "albedo"),
         "roughness, glossy parts": rank(glossy, "roughness"),
-        "gloss": rank(rows, "gloss"),
-        "gloss, no metals": rank(dull, "gloss"),
     }
-    common.emit({"parts": rows, "rank": correlations}, {"Parts": rows, "Rank correlation": [correlations]}, options)
+    told = {"metals": share_told(rows, 1), "others": share_told(rows, 0)}
+    tables = {"Parts": rows, "Rank correlation": [correlations], "Told": [told]}
+    common.emit({"parts": rows, "rank": correlations, "told": told}, tables, options)
 
 
 def parts(run: Run, dataset: Dataset) -> list[common.Row]:
@@ -54,7 +50,7 @@ def parts(run: Run, dataset: Dataset) -> list[common.Row]:
     if not isinstance(materials, Mapping):
         raise InputError(f"{dataset.root}: expected a dataset of `spacesim generate`, found no materials in scene.json")
     seen = [pixels(run, dataset, index) for index in range(len(dataset.test))]
-    number, albedo, gloss, roughness, true = (np.concatenate(values) for values in zip(*seen, strict=True))
+    number, albedo, metal, roughness, true = (np.concatenate(values) for values in zip(*seen, strict=True))
     rows: list[common.Row] = []
     for part in dataset.scene["parts"]:
         mine = number == part["id"]
@@ -62,22 +58,19 @@ def parts(run: Run, dataset: Dataset) -> list[common.Row]:
             continue
         material = materials[part["material"]]
         alpha, is_metal = alpha_of(material["bsdf"]), holds(material["bsdf"], "type", "roughconductor")
-        reflectance = float(luminance(np.array(material["albedo"], float)))
         row = {"part": part["name"], "material": part["material"], "pixels": int(mine.sum())}
         row |= {"albedo": albedo[mine].mean(), "true albedo": true[mine].mean()}
-        row |= {"gloss": gloss[mine].mean(), "true gloss": reflectance if is_metal else COAT * (alpha is not None)}
+        row |= {"metal": metal[mine].mean(), "true metal": int(is_metal)}
         rows.append(row | {"roughness": np.median(roughness[mine]), "true roughness": alpha})
     return [{key: round(float(v), 3) if isinstance(v, float) else v for key, v in row.items()} for row in rows]
 
 
 def pixels(run: Run, dataset: Dataset, index: int) -> list[np.ndarray]:
-    """Of a test frame's pixels that show a part: its number, albedo, gloss, roughness, true albedo, [P] each."""
+    """Of a test frame's pixels that show a part: its number, albedo, metal, roughness, true albedo, [P] each."""
     frame = dataset.test[index]
     truth, view = load_truth(dataset, frame), run.draw_material(frame.camera)
-    shiny = replace(run.material, diffuse=np.zeros_like(run.material.diffuse))
-    drawn = draw_material(run.gaussians, shiny, run.learned_normals, frame.camera, run.antialiased, run.supersample)
     mask = truth.part_id > 0
-    planes = luminance(view.albedo), luminance(drawn.albedo), view.roughness, luminance(truth.albedo)
+    planes = luminance(view.albedo), view.metallic, view.roughness, luminance(truth.albedo)
     return [truth.part_id[mask], *(plane[mask].astype(np.float64) for plane in planes)]
 
 
@@ -102,6 +95,13 @@ def rank(rows: list[common.Row], key: str) -> float | None:
     if len(pairs) < 3 or (np.ptp(pairs, axis=0) == 0).any():
         return None
     return round(float(spearmanr(*pairs.T).statistic), 2)
+
+
+def share_told(rows: list[common.Row], metal: int) -> float | None:
+    """Of the pixels of metals, or of other parts, the mean share that is said to be that."""
+    of_kind = [row for row in rows if row["true metal"] == metal]
+    right = sum(row["pixels"] * abs(1 - metal - row["metal"]) for row in of_kind)
+    return round(right / sum(row["pixels"] for row in of_kind), 2) if of_kind else None
 
 
 if __name__ == "__main__":

@@ -427,7 +427,7 @@ def test_materials_of_a_run(spacesim, tiny_data, tmp_path):
     short = ("--iterations", 40, "--set", "init_count=300", "--preset", "demo", "--method", "relight")
     assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *short).code == 0
     view = load_run(tmp_path / "run").draw_material(read_dataset(tmp_path / "data").frames[3].camera)
-    for kind, shape in (("albedo", (40, 40, 3)), ("roughness", (40, 40))):
+    for kind, shape in (("albedo", (40, 40, 3)), ("roughness", (40, 40)), ("metallic", (40, 40))):
         for suffix in ("png", "exr"):
             out = tmp_path / f"{kind}.{suffix}"
             done = spacesim("render", tmp_path / "run", "--frame", 3, "--kind", kind, "--out", out)
@@ -442,8 +442,8 @@ def test_materials_of_a_run(spacesim, tiny_data, tmp_path):
     few = "--views", 3, "--voxel", 0.1
     done = spacesim("export", tmp_path / "run", "--mesh", tmp_path / "a.glb", *few)
     assert (done.code, done.output.endswith(" m, with albedo\n")) == (0, True), done
-    (mesh,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
-    assert mesh.visual.vertex_attributes["color"].shape == (len(mesh.vertices), 4)
+    for mesh in trimesh.load(tmp_path / "a.glb", process=False).geometry.values():
+        assert mesh.visual.vertex_attributes["color"].shape == (len(mesh.vertices), 4)
     shutil.move(tmp_path / "data", tmp_path / "elsewhere")
     done = spacesim("export", tmp_path / "run", "--mesh", tmp_path / "b.glb", *few, "--data", tmp_path / "elsewhere")
     assert done.errors == [RELATIVE]

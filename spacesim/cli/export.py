@@ -144,7 +144,7 @@ def _scale(options: argparse.Namespace) -> float:
 
 
 def _export_mesh(options: argparse.Namespace) -> None:
-    from spacesim.data.mesh import mesh_suffix, write_mesh
+    from spacesim.data.mesh import VertexSurface, mesh_suffix, write_mesh
     from spacesim.data.records import Sun
     from spacesim.data.store import read_dataset
     from spacesim.methods import load_run
@@ -180,7 +180,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
     if len(surface.faces) == 0:
         raise WorkError(f"{options.path}: no view of the run shows an opaque surface, so there is no mesh to write")
     sun = replace(Sun.from_angles(*options.sun), earth=_earth(options, run)) if options.sun else None
-    colors, roughness = None, None
+    colors, material = None, None
     if sun is not None and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     words = "; colours need --sun" if holds_colors else ""
@@ -199,10 +199,10 @@ def _export_mesh(options: argparse.Namespace) -> None:
                 lambda camera: color_of_material(run.draw_material(camera)),
                 config.views,
                 report,
-                channels=4,
+                channels=5,
             )
-        colors, roughness, words = values[:, :3], values[:, 3], ", with albedo"
-    write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up, roughness)
+        colors, material, words = values[:, :3], VertexSurface(values[:, 3], values[:, 4]), ", with albedo"
+    write_mesh(options.mesh, frame.sized(surface.vertices), surface.faces, colors, options.up, material)
     interrupts.print_output(
         f"{options.mesh}: {len(surface.faces)} faces from {surface.views} views, voxels of {surface.voxel:.4g} m{words}"
     )

@@ -1,8 +1,8 @@
-"""Binary glTF 2.0 with one primitive (Khronos: glTF 2.0 Specification, chapters 3.6, 3.7 and 4.4)."""
+"""Binary glTF 2.0 of one mesh (Khronos: glTF 2.0 Specification, chapters 3.6, 3.7 and 4.4)."""
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +21,14 @@ def write_glb(
     path: Path,
     attributes: Mapping[str, np.ndarray],
     mode: int,
-    indices: np.ndarray | None = None,
-    primitive: JsonMapping | None = None,
+    primitives: Sequence[tuple[np.ndarray | None, JsonMapping]],
     document: JsonMapping | None = None,
 ) -> None:
-    """Write one primitive.
+    """Write primitives that share their vertices.
 
     attributes: {semantic: [N] or [N, C]}, float32; "POSITION" is one of them
-    indices: uint32 [M], or None;  primitive, document: what else its object and the whole file say
+    primitives: of each its indices, uint32 [M] or None, and what else its object says;  document: what else the file
+    says
     Raises InputError where it does not fit into the format's 4 GB, and where it cannot be written.
     """
     views: list[dict[str, JsonValue]] = []
@@ -51,17 +51,20 @@ def write_glb(
         accessor = add(array, _VERTICES)
         if name == "POSITION":  # which must have its bounds
             accessor["min"], accessor["max"] = (edge.tolist() for edge in (array.min(axis=0), array.max(axis=0)))
-    described: dict[str, JsonValue] = {"attributes": numbers, "mode": mode}
-    if indices is not None:
-        described["indices"] = len(accessors)
-        add(indices, _INDICES)
+    described: list[JsonValue] = []
+    for indices, rest in primitives:
+        own: dict[str, JsonValue] = {"attributes": numbers, "mode": mode}
+        if indices is not None:
+            own["indices"] = len(accessors)
+            add(indices, _INDICES)
+        described.append({**own, **rest})
     body = b"".join(parts)
     whole = {
         "asset": {"version": "2.0", "generator": "spacesim"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{**described, **(primitive or {})}]}],
+        "meshes": [{"primitives": described}],
         "buffers": [{"byteLength": len(body)}],
         "bufferViews": views,
         "accessors": accessors,

@@ -193,19 +193,27 @@ def mesh_suffix(path: Path) -> str:
     return suffix
 
 
+@dataclass(frozen=True, eq=False)
+class VertexSurface:
+    """What vertices are made of, beside their albedo."""
+
+    roughness: np.ndarray  #: [V] alpha of GGX
+    metallic: np.ndarray  #: [V] share of metals, in [0, 1]
+
+
 def write_mesh(
     path: Path,
     vertices: Array,
     faces: np.ndarray,
     colors: np.ndarray | None = None,
     up: str | None = None,
-    roughness: np.ndarray | None = None,
+    surface: VertexSurface | None = None,
 ) -> None:
     """Write vertices [V, 3] metres and faces [F, 3] as PLY, OBJ, STL or glTF (.glb), by the file's name.
 
     colors: [V, 3] sRGB values of the vertices, which STL cannot hold; light is in them, so glTF says that they are to
     be shown unlit;  up: which axis of the file +z becomes, one of UPRIGHT; by default "y" in glTF, else "z"
-    roughness: [V] alphas of GGX of a surface whose colours are albedo, to be lit: glTF has them
+    surface: of what has albedo as colours, to be lit: glTF has it
     Raises InputError for another name, for colours in STL and where it cannot be written.
     """
     import trimesh
@@ -215,7 +223,7 @@ def write_mesh(
         raise InputError(f"{path}: expected a .glb, .obj or .ply, which hold colours, found STL")
     vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T
     if suffix == ".glb":
-        _write_glb_mesh(path, vertices, faces, colors, roughness)
+        _write_glb_mesh(path, vertices, faces, colors, surface)
         return
     bytes_of = None if colors is None else np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
     mesh = trimesh.Trimesh(vertices, faces, vertex_colors=bytes_of, process=False)
@@ -224,25 +232,36 @@ def write_mesh(
 
 
 def _write_glb_mesh(
-    path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None, roughness: np.ndarray | None
+    path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None, surface: VertexSurface | None
 ) -> None:
-    """glTF has no roughness a vertex: `_ROUGHNESS` is an attribute of ours, of which its material has the median. Both
-    are square roots of alpha, as glTF (3.9.2, appendix B.3) means them."""
+    """glTF has no roughness a vertex: `_ROUGHNESS` and `_METALLIC` are attributes of ours. Metals and what is none have
+    a material each with the median roughness. Roughness is the square root of alpha, as in glTF (3.9.2, B.3)."""
     attributes = {"POSITION": vertices.astype(np.float32)}
-    surface: dict[str, JsonValue] = {"metallicFactor": 0}
-    material: dict[str, JsonValue] = {"doubleSided": True, "pbrMetallicRoughness": surface}
-    document: dict[str, JsonValue] = {"materials": [material]}
+    document: dict[str, JsonValue] = {}
+    groups, materials = [faces], [_gltf_material()]
     if colors is not None:
         opaque = np.ones((len(colors), 1))
         linear = linear_from_srgb(np.clip(colors, 0, 1))
         attributes["COLOR_0"] = np.concatenate([linear, opaque], axis=1).astype(np.float32)
-    if roughness is not None:
-        attributes["_ROUGHNESS"] = np.sqrt(roughness).astype(np.float32)
-        surface["roughnessFactor"] = round(float(np.median(attributes["_ROUGHNESS"])), 4)
+    if surface is not None:
+        roughness = np.sqrt(surface.roughness).astype(np.float32)
+        attributes |= {"_ROUGHNESS": roughness, "_METALLIC": surface.metallic.astype(np.float32)}
+        is_metal = surface.metallic[faces].mean(axis=1) >= 0.5
+        parts = [(faces[is_metal == metal], float(metal)) for metal in (False, True) if (is_metal == metal).any()]
+        groups = [part for part, _ in parts]
+        materials = [_gltf_material(metallic, float(np.median(roughness[part]))) for part, metallic in parts]
     elif colors is not None:
-        material["extensions"] = {"KHR_materials_unlit": {}}
+        materials[0]["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
-    write_glb(path, attributes, TRIANGLES, faces.ravel().astype(np.uint32), {"material": 0}, document)
+    primitives = [(part.ravel().astype(np.uint32), {"material": number}) for number, part in enumerate(groups)]
+    write_glb(path, attributes, TRIANGLES, primitives, {"materials": list(materials), **document})
+
+
+def _gltf_material(metallic: float = 0.0, roughness: float | None = None) -> dict[str, JsonValue]:
+    surface: dict[str, JsonValue] = {"metallicFactor": metallic}
+    if roughness is not None:
+        surface["roughnessFactor"] = round(roughness, 4)
+    return {"doubleSided": True, "pbrMetallicRoughness": surface}
 
 
 class SignedDistance:

@@ -44,8 +44,8 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
 
 
 def write_material(view: MaterialView, kind: str, path: Path) -> None:
-    """kind: "albedo" (PNG: as sRGB values, straight alpha; EXR: linear) or "roughness". Raises InputError for another
-    suffix than .png or .exr."""
+    """kind: "albedo" (PNG: as sRGB values, straight alpha; EXR: linear), "roughness" or "metallic". Raises InputError
+    for another suffix than .png or .exr."""
     plane = np.asarray(getattr(view, kind))
     if path.suffix == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})

@@ -15,7 +15,7 @@ more until it is written."""
 
 
 KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction
-MATERIAL_KINDS = ("albedo", "roughness")  #: of pictures of a `MaterialView`, which no Sun changes
+MATERIAL_KINDS = ("albedo", "roughness", "metallic")  #: of pictures of a `MaterialView`, which no Sun changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,9 @@ class ComposedPrediction(Prediction):
 class MaterialView:
     """What a camera sees of the materials that were read out of a model, float32, straight: not weighted by alpha."""
 
-    albedo: np.ndarray  #: [H, W, 3] linear reflectance, diffuse and specular; 0 where alpha is 0, as all here
+    albedo: np.ndarray  #: [H, W, 3] linear reflectance, of metals the specular one; 0 where alpha is 0, as all here
     roughness: np.ndarray  #: [H, W] alpha of GGX, 1 where no gloss is seen
+    metallic: np.ndarray  #: [H, W] share of metals, in [0, 1]
     normal: np.ndarray  #: [H, W, 3] unit vectors in world axes, of the learned normals
     alpha: np.ndarray  #: [H, W]
 

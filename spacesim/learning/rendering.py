@@ -73,13 +73,18 @@ class Rendering:
 
     @property
     def albedo(self) -> np.ndarray:
-        """[H, W, 3] float32: linear reflectance, diffuse and specular, of a run that `Run.draw_material` takes."""
+        """[H, W, 3] float32: linear reflectance, of metals specular, of a run that `Run.draw_material` takes."""
         return self._material.albedo
 
     @property
     def roughness(self) -> np.ndarray:
         """[H, W] float32: alpha of GGX, 1 where no gloss is seen, of a run that `Run.draw_material` takes."""
         return self._material.roughness
+
+    @property
+    def metallic(self) -> np.ndarray:
+        """[H, W] float32 in [0, 1]: share of metals, of a run that `Run.draw_material` takes."""
+        return self._material.metallic
 
     @cached_property
     def _material(self) -> MaterialView:
@@ -88,8 +93,8 @@ class Rendering:
     def save(self, path: str | Path, kind: str = "rgb") -> Path:
         """Write a PNG to look at or an EXR to compute with; returns its path.
 
-        kind: "rgb", "alpha", "depth", "normal", "shadow", "albedo" or "roughness". Raises InputError for another, for
-        another suffix, and for what a method is without.
+        kind: "rgb", "alpha", "depth", "normal", "shadow", "albedo", "roughness" or "metallic". Raises InputError for
+        another, for another suffix, and for what a method is without.
         """
         path = as_path(path, "path")
         if kind not in (*KINDS, *MATERIAL_KINDS):

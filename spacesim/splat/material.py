@@ -60,7 +60,7 @@ def draw_material(
 ) -> MaterialView:
     """What a camera sees of the materials and learned normals ([N, 3] world axes, of any length) of Gaussians."""
     check_picture(camera)
-    planes = [*upload_rows(material.albedo.T), upload(material.roughness)]
+    planes = [*upload_rows(material.albedo.T), upload(material.roughness), upload(material.metallic)]
     learned = unit_normals(upload_rows(normals.T))
 
     def draw(seen: Pinhole) -> RenderOutput:
@@ -69,9 +69,9 @@ def draw_material(
 
     output = render_supersampled(draw, camera, supersample)
     assert output.features is not None
-    straight = [over_alpha(plane, output.alpha) for plane in output.features[:4]]
-    shown = planes_image([*straight, *unit(ad.Array3f(output.features[4:]))], camera.width, camera.height)
-    return MaterialView(shown[..., :3], shown[..., 3], shown[..., 4:], output.image("alpha"))
+    straight = [over_alpha(plane, output.alpha) for plane in output.features[:5]]
+    shown = planes_image([*straight, *unit(ad.Array3f(output.features[5:]))], camera.width, camera.height)
+    return MaterialView(shown[..., :3], shown[..., 3], shown[..., 4], shown[..., 5:], output.image("alpha"))
 
 
 def no_material(path: Path, found: str) -> InputError:

@@ -39,7 +39,7 @@ def reading(make_run, albedo: float = 0.1):
     def draw_material(camera):
         size = camera.height, camera.width
         normal = np.tile([np.sqrt(0.75), 0, 0.5], (*size, 1))
-        return MaterialView(np.full((*size, 3), albedo), np.ones(size), normal, np.ones(size))
+        return MaterialView(np.full((*size, 3), albedo), np.ones(size), np.zeros(size), normal, np.ones(size))
 
     run.draw_material = draw_material
     return run

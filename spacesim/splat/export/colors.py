@@ -68,9 +68,9 @@ def color_vertices(
 
 
 def color_of_material(view: MaterialView) -> Prediction:
-    """Materials as a picture of four channels for `color_vertices`, weighted by alpha: albedo as sRGB values,
-    roughness."""
-    straight = np.concatenate([srgb_from_linear(view.albedo), view.roughness[..., None]], axis=-1)
+    """Materials as a picture of five channels for `color_vertices`, weighted by alpha: albedo as sRGB values,
+    roughness, metallic."""
+    straight = np.dstack([srgb_from_linear(view.albedo), view.roughness, view.metallic])
     return Prediction(straight * view.alpha[..., None], view.alpha, np.zeros_like(view.alpha), None)
 
 

@@ -41,7 +41,7 @@ def write_gaussian_glb(gaussians: Gaussians, path: Path) -> None:
             attributes[f"{NAME}:SH_DEGREE_{degree}_COEF_{k}"] = arrays["sh"][:, degree * degree + k]
     extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    write_glb(path, attributes, POINTS, None, {"extensions": {NAME: extension}}, {"extensionsUsed": [NAME]})
+    write_glb(path, attributes, POINTS, [(None, {"extensions": {NAME: extension}})], {"extensionsUsed": [NAME]})
 
 
 def opacity_of(logits: np.ndarray) -> np.ndarray:

@@ -1,11 +1,13 @@
-"""The material in a model of light: what its field answers about a Gaussian's normal, fitted by two lobes.
+"""The material in a model of light: what its field answers about a Gaussian's normal, as a metal or not.
 
 A field of cosines (`SurfaceConfig`) says how bright a Gaussian is under any Sun from anywhere, fully lit, nothing
-bounced. A Lambertian surface under facets is fitted to that: GGX (Walter et al. 2007) with Smith's height-correlated
-masking (Heitz 2014) and Schlick's Fresnel term (1994). Nothing of it was trained as such.
+bounced. A metal or something else is fitted to that, as glTF 2.0 (appendix B) tells them apart: a metal is facets
+alone; what is none is a Lambertian surface, bare or under facets that reflect little. Facets are GGX (Walter et al.
+2007) with Smith's height-correlated masking (Heitz 2014) and Schlick's Fresnel term (1994). Nothing of it was trained
+as such. Were facets of any strength allowed over a Lambertian surface, broad lobes would pass for each other.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +27,8 @@ HALFWAY_DEG, DIFFERENCE_DEG, AROUND_DEG = (0, 3, 7, 12, 20, 30, 42, 55), (5, 20,
 LEAST_COSINE = 0.25  #: of the normal with Sun and view: what brushes the surface says little
 SATURATED = 0.98  #: a colour from which the field says no more than that it is at least as bright
 FAINT = 0.05  #: errors count by what is reflected plus this, of what a white surface does
+MOST_COAT = 0.08  #: that facets of what is no metal reflect at normal incidence, as in Burley 2012
+LEAST_METAL = 0.3  #: of a metal's brightest channel: none in assets/materials.toml reflects less
 CHUNK = 1 << 14  #: Gaussians that are fitted at once
 
 
@@ -32,20 +36,16 @@ CHUNK = 1 << 14  #: Gaussians that are fitted at once
 class FittedMaterial:
     """Of N Gaussians, float32; linear camera RGB."""
 
-    diffuse: np.ndarray  #: [N, 3] reflectance of the Lambertian lobe
-    specular: np.ndarray  #: [N, 3] reflectance of the facets at normal incidence, in [0, 1]
+    #: [N, 3] reflectance: a metal's at normal incidence, in [0, 1], else of the Lambertian surface (under its facets)
+    albedo: np.ndarray
+    metallic: np.ndarray  #: [N] 1 of metals, 0 of others
     roughness: np.ndarray  #: [N] alpha of GGX, 1 where no facets are seen
 
     @staticmethod
     def joined(materials: "Sequence[FittedMaterial]") -> "FittedMaterial":
         """Of one set of Gaussians after another."""
-        rows = ((each.diffuse, each.specular, each.roughness) for each in materials)
+        rows = ((each.albedo, each.metallic, each.roughness) for each in materials)
         return FittedMaterial(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
-
-    @property
-    def albedo(self) -> np.ndarray:
-        """[N, 3] of both lobes: of a dull surface its diffuse reflectance, of a metal its specular one."""
-        return self.diffuse + self.specular
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,26 +122,51 @@ def read_material(
 
 def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> FittedMaterial:
     """By least squares of what is `known`, [K, 3, N] bool, of light `reflected` [K, 3, N], of which a white Lambertian
-    surface that faces the Sun reflects 1: for each roughness the best reflectances, none below 0, in closed form."""
+    surface that faces the Sun reflects 1: the best reflectances of each kind of surface in closed form, then the best
+    kind."""
     count = reflected.shape[2]
     light = np.moveaxis(reflected, 0, 2).reshape(3 * count, -1)
     weights = np.moveaxis(known, 0, 2).reshape(3 * count, -1) / (np.maximum(light, 0) + FAINT) ** 2
-    lambert = angles.suns[:, 2]
-    least = np.full(count, np.inf)
-    diffuse, specular, roughness = np.zeros((3, count)), np.zeros((3, count)), np.ones(count)
-    for tried in (None, *ROUGHNESSES):
-        facets, rest = (0 * lambert, 0 * lambert) if tried is None else angles.facets(tried)
-        errors, *lobes = (row.reshape(3, count) for row in _fit_lobes(light - rest, weights, lambert, facets))
-        error = errors.sum(axis=0)
+    least, albedo = np.full(count, np.inf), np.zeros((3, count))
+    metallic, roughness = np.zeros(count), np.ones(count)
+    for kind in _surfaces(angles):
+        fitted = _fit_lobes(light - kind.rest, weights, kind.lambert, kind.facets, kind.most)
+        errors, diffuse, specular = (row.reshape(3, count) for row in fitted)
+        tried, error = specular if kind.is_metal else diffuse, errors.sum(axis=0)
         better = error < least
-        least = np.where(better, error, least)
-        diffuse, specular = (np.where(better, new, old) for new, old in zip(lobes, (diffuse, specular), strict=True))
-        roughness = np.where(better, 1.0 if tried is None else tried, roughness)
-    return FittedMaterial(*(np.float32(values.T) for values in (diffuse, specular, roughness)))
+        if kind.is_metal:
+            better &= tried.max(axis=0) >= LEAST_METAL
+        least, albedo = np.where(better, error, least), np.where(better, tried, albedo)
+        metallic = np.where(better, kind.is_metal, metallic)
+        roughness = np.where(better, kind.roughness, roughness)
+    return FittedMaterial(*(np.float32(values.T) for values in (albedo, metallic, roughness)))
 
 
-def _fit_lobes(light: Array, weights: Array, lambert: Array, facets: Array) -> tuple[Array, Array, Array]:
-    """([M] weighted squares left, [M] diffuse >= 0, [M] specular in [0, 1]) of light [M, K]: the quadratic's minimum
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A kind of surface: it reflects diffuse * lambert + specular * facets + rest, [K] each, as shares of a white
+    Lambertian one that faces the Sun."""
+
+    roughness: float
+    is_metal: bool
+    lambert: Array
+    facets: Array
+    rest: Array
+    most: float  #: that facets reflect at normal incidence
+
+
+def _surfaces(angles: SunAndView) -> Iterator[_Surface]:
+    """All that are tried."""
+    lambert, none = angles.suns[:, 2], np.zeros(len(angles.suns))
+    yield _Surface(1.0, False, lambert, none, none, 0.0)
+    for roughness in ROUGHNESSES:
+        facets, rest = angles.facets(roughness)
+        yield _Surface(roughness, False, lambert, facets, rest, MOST_COAT)
+        yield _Surface(roughness, True, none, facets, rest, 1.0)
+
+
+def _fit_lobes(light: Array, weights: Array, lambert: Array, facets: Array, most: float) -> tuple[Array, Array, Array]:
+    """([M] weighted squares left, [M] diffuse >= 0, [M] specular in [0, most]) of light [M, K]: the quadratic's minimum
     where that is allowed, else the best on an edge."""
     ll, ff, lf = weights @ lambert**2, weights @ facets**2, weights @ (lambert * facets)
     weighted = weights * light
@@ -149,10 +174,10 @@ def _fit_lobes(light: Array, weights: Array, lambert: Array, facets: Array) -> t
     yy = np.einsum("mk,mk->m", weighted, light)
     ll, safe = np.maximum(ll, 1e-30), np.maximum(ff, 1e-30)
     determinant = np.maximum(ll * ff - lf**2, 1e-12 * ll * safe)
-    zero, one = np.zeros_like(ll), np.ones_like(ll)
-    diffuse = np.stack([(ff * yl - lf * yf) / determinant, zero, yl / ll, (yl - lf) / ll])
-    specular = np.stack([(ll * yf - lf * yl) / determinant, np.clip(yf / safe, 0, 1), zero, one])
+    zero, full = np.zeros_like(ll), np.full_like(ll, most)
+    diffuse = np.stack([(ff * yl - lf * yf) / determinant, zero, yl / ll, (yl - most * lf) / ll])
+    specular = np.stack([(ll * yf - lf * yl) / determinant, np.clip(yf / safe, 0, most), zero, full])
     error = yy - 2 * (diffuse * yl + specular * yf) + diffuse**2 * ll + specular**2 * ff + 2 * diffuse * specular * lf
-    allowed = (diffuse >= 0) & (specular >= 0) & (specular <= 1)
+    allowed = (diffuse >= 0) & (specular >= 0) & (specular <= most)
     best = np.argmin(np.where(allowed, error, np.inf), axis=0)[None]
     return tuple(np.take_along_axis(values, best, axis=0)[0] for values in (error, diffuse, specular))

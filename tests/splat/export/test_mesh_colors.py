@@ -9,7 +9,7 @@ from test_tsdf import cameras, rays
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.mesh import write_mesh
+from spacesim.data.mesh import VertexSurface, write_mesh
 from spacesim.data.records import Camera
 from spacesim.learning.prediction import MaterialView, Prediction
 from spacesim.splat.export.colors import color_of_material, color_vertices
@@ -105,27 +105,39 @@ def test_colors_in_files(tmp_path, suffix):
 
 
 def test_materials_in_gltf_are_lit(tmp_path):
-    """Base colours, roughness a vertex and one for all: square roots of alpha."""
+    """Base colours, roughness and metal a vertex, and a material of metals and one of others: roots of alpha."""
     mesh = trimesh.creation.icosphere(2)
-    colors, roughness = paint(np.array(mesh.vertices)), np.linspace(0.04, 0.49, len(mesh.vertices))
-    write_mesh(tmp_path / "a.glb", np.array(mesh.vertices), np.array(mesh.faces), colors, roughness=roughness)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    colors, roughness = paint(vertices), np.linspace(0.04, 0.49, len(vertices))
+    metallic = (vertices[:, 2] > 0).astype(float)
+    write_mesh(tmp_path / "a.glb", vertices, faces, colors, surface=VertexSurface(roughness, metallic))
     document, body = glb_chunks(tmp_path / "a.glb")
-    (primitive,) = document["meshes"][0]["primitives"]
-    attributes = {name: glb_array(document, body, index) for name, index in primitive["attributes"].items()}
-    (material,) = document["materials"]
-    assert primitive["material"] == 0
     assert "extensionsUsed" not in document
-    assert "extensions" not in material
-    surface = material["pbrMetallicRoughness"]
-    assert surface == {"metallicFactor": 0, "roughnessFactor": pytest.approx(np.sqrt(np.median(roughness)), abs=2e-3)}
-    np.testing.assert_allclose(attributes["COLOR_0"][:, :3], light_of(colors), atol=1e-6)
-    np.testing.assert_allclose(attributes["_ROUGHNESS"].ravel(), np.sqrt(roughness), atol=1e-6)
+    assert not any("extensions" in material for material in document["materials"])
+    seen = []
+    for metal, primitive in enumerate(document["meshes"][0]["primitives"]):
+        attributes = {name: glb_array(document, body, index) for name, index in primitive["attributes"].items()}
+        np.testing.assert_allclose(attributes["COLOR_0"][:, :3], light_of(colors), atol=1e-6)
+        np.testing.assert_allclose(attributes["_ROUGHNESS"].ravel(), np.sqrt(roughness), atol=1e-6)
+        assert np.array_equal(attributes["_METALLIC"].ravel(), metallic)
+        part = glb_array(document, body, primitive["indices"]).reshape(-1, 3)
+        assert ((metallic[part].mean(axis=1) > 0.5) == metal).all()
+        middle = pytest.approx(np.median(np.sqrt(roughness[part])), abs=1e-4)
+        surface = document["materials"][primitive["material"]]["pbrMetallicRoughness"]
+        assert surface == {"metallicFactor": metal, "roughnessFactor": middle}
+        seen.append(part)
+    assert sorted(np.concatenate(seen).tolist()) == sorted(faces.tolist())
+    write_mesh(tmp_path / "b.glb", vertices, faces, colors, surface=VertexSurface(roughness, 1 - 0 * metallic))
+    document, _ = glb_chunks(tmp_path / "b.glb")
+    (primitive,), (material,) = document["meshes"][0]["primitives"], document["materials"]
+    assert (primitive["material"], material["pbrMetallicRoughness"]["metallicFactor"]) == (0, 1)
 
 
-def test_a_picture_of_materials_has_four_channels():
-    view = MaterialView(np.full((2, 3, 3), 0.5), np.full((2, 3), 0.3), np.zeros((2, 3, 3)), np.full((2, 3), 0.5))
+def test_a_picture_of_materials_has_five_channels():
+    planes = np.full((2, 3), 0.3), np.full((2, 3), 0.9)
+    view = MaterialView(np.full((2, 3, 3), 0.5), *planes, np.zeros((2, 3, 3)), np.full((2, 3), 0.5))
     shown = color_of_material(view)
-    np.testing.assert_allclose(shown.rgb / 0.5, np.tile([*srgb_of(np.full(3, 0.5)), 0.3], (2, 3, 1)), atol=1e-6)
+    np.testing.assert_allclose(shown.rgb / 0.5, np.tile([*srgb_of(np.full(3, 0.5)), 0.3, 0.9], (2, 3, 1)), atol=1e-6)
     centres, mesh = [np.zeros(3)], spheres(np.zeros(3))
     camera = Camera.from_fov(look_at(np.array([4.0, 0, 0]), np.zeros(3)), 96, 96, 40.0)
     one = lambda c: Prediction(np.tile([0.1, 0.2, 0.3, 0.4], (96, 96, 1)), np.ones((96, 96)), np.ones(1), None)  # noqa: E731

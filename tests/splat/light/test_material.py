@@ -13,12 +13,15 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera
+from spacesim.scenes.materials.table import material, material_names
 from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import FieldConfig, SurfaceConfig
 from spacesim.splat.light.material import (
+    LEAST_METAL,
+    MOST_COAT,
     ROUGHNESSES,
     SATURATED,
     FittedMaterial,
@@ -76,10 +79,10 @@ def run(tmp_path) -> Run:
     return Run(tmp_path / "run", {"method": "relight"}, {}, Gaussians.from_numpy(splats()), 1000, light_model())
 
 
-KNOWN = [
-    (np.array([0.1, 0.2, 0.3]), np.array([0.04, 0.04, 0.04]), 0.2),  # paint with a gloss
+KNOWN = [  # diffuse, specular, alpha
+    (np.array([0.1, 0.2, 0.3]), np.full(3, 0.04), 0.2),  # paint with a gloss
     (np.zeros(3), np.array([0.8, 0.45, 0.05]), 0.4),  # gold
-    (np.array([0.02, 0.02, 0.1]), np.array([0.1, 0.05, 0.0]), 0.07),
+    (np.array([0.02, 0.02, 0.1]), np.array([0.08, 0.05, 0.0]), 0.07),  # a solar cell
 ]
 
 
@@ -87,58 +90,80 @@ def test_known_materials_come_back():
     angles = SunAndView.spread()
     light = answers(angles, KNOWN)
     found = fit_material(angles, light, np.ones_like(light, bool))
-    np.testing.assert_allclose(found.diffuse, [known[0] for known in KNOWN], atol=2e-4)
-    np.testing.assert_allclose(found.specular, [known[1] for known in KNOWN], atol=2e-4)
+    np.testing.assert_allclose(found.albedo, [KNOWN[0][0], KNOWN[1][1], KNOWN[2][0]], atol=2e-4)
+    assert found.metallic.tolist() == [0, 1, 0]
     np.testing.assert_allclose(found.roughness, [known[2] for known in KNOWN])
-    np.testing.assert_allclose(found.albedo, found.diffuse + found.specular)
 
 
 def test_a_roughness_between_those_that_are_tried_gets_a_neighbour():
     angles = SunAndView.spread()
-    light = answers(angles, [(np.full(3, 0.2), np.full(3, 0.5), 0.24)])
+    light = answers(angles, [(np.full(3, 0.3), np.full(3, 0.06), 0.24), (np.zeros(3), np.full(3, 0.6), 0.24)])
     found = fit_material(angles, light, np.ones_like(light, bool))
-    assert found.roughness[0] in np.float32([0.2, 0.28])
-    np.testing.assert_allclose(found.albedo, 0.7, rtol=0.1)
+    assert np.isin(found.roughness, np.float32([0.2, 0.28])).all()
+    assert found.metallic.tolist() == [0, 1]
+    np.testing.assert_allclose(found.albedo, [[0.3] * 3, [0.6] * 3], rtol=0.1)
 
 
 def test_a_lambertian_surface_has_no_gloss():
     angles = SunAndView.spread()
     light = answers(angles, [(np.full(3, rho), np.zeros(3), 1.0) for rho in (0.02, 0.5, 0.95)])
     found = fit_material(angles, light, np.ones_like(light, bool))
-    np.testing.assert_allclose(found.diffuse, np.tile([[0.02], [0.5], [0.95]], 3), rtol=1e-6)
-    assert not found.specular.any()
+    np.testing.assert_allclose(found.albedo, np.tile([[0.02], [0.5], [0.95]], 3), rtol=1e-6)
+    assert not found.metallic.any()
     assert (found.roughness == 1).all()
+
+
+def test_a_dark_sheen_is_no_metal():
+    """Facets alone that reflect a tenth: less than any metal of the table, so paint, whatever else fits better."""
+    table = [material(name) for name in material_names()]
+    metals = [row.albedo for row in table if row.bsdf["type"] == "roughconductor"]
+    assert len(metals) >= 3
+    assert min(max(albedo) for albedo in metals) >= LEAST_METAL
+    angles = SunAndView.spread()
+    light = answers(
+        angles, [(np.zeros(3), np.full(3, 0.1), 0.4), (np.zeros(3), np.array([LEAST_METAL, 0.1, 0.1]), 0.4)]
+    )
+    found = fit_material(angles, light, np.ones_like(light, bool))
+    assert found.metallic.tolist() == [0, 1]
+    assert 0 < found.albedo[0].max() < 0.1
 
 
 def test_what_is_saturated_says_nothing():
     """A glint cut off: its flanks tell."""
     angles = SunAndView.spread()
-    light = answers(angles, KNOWN[:1])
-    clipped = np.minimum(light, 0.3)
+    light = answers(angles, KNOWN[1:2])
+    clipped = np.minimum(light, 0.5)
     assert (clipped < light).any()
-    found = fit_material(angles, clipped, clipped == light)
-    np.testing.assert_allclose(found.specular, 0.04, atol=1e-3)
-    assert fit_material(angles, clipped, np.ones_like(light, bool)).specular[0, 2] < 0.02
+    np.testing.assert_allclose(fit_material(angles, clipped, clipped == light).albedo, [KNOWN[1][1]], atol=1e-3)
+    assert fit_material(angles, clipped, np.ones_like(light, bool)).albedo[0, 0] < 0.7
 
 
-def test_the_closed_form_is_the_bounded_minimum():
+@pytest.mark.parametrize("most", [1.0, MOST_COAT])
+def test_the_closed_form_is_the_bounded_minimum(most):
     """Of any numbers, also where reflectances reach their bounds."""
     rng = np.random.default_rng(1)
     lambert, facets = rng.uniform(0.2, 1, 9), rng.uniform(0, 3, 9)
-    mixed = np.outer(rng.uniform(0, 1, 20), lambert) + np.outer(rng.uniform(0, 2, 20), facets)
-    light = np.concatenate([rng.normal(0, 2, (40, 9)), mixed + rng.normal(0, 0.1, (20, 9))])
+    mixed = np.outer(rng.uniform(0, 1, 20), lambert) + np.outer(rng.uniform(0, 2 * most, 20), facets)
+    light = np.concatenate([rng.normal(0, 2, (40, 9)), mixed + rng.normal(0, 0.1 * most, (20, 9))])
     weights = rng.uniform(0, 2, light.shape)
-    errors, diffuse, specular = _fit_lobes(light, weights, lambert, facets)
+    errors, diffuse, specular = _fit_lobes(light, weights, lambert, facets, most)
     reached = set()
     for row in range(len(light)):
         root = np.sqrt(weights[row])
         best = lsq_linear(
-            root[:, None] * np.stack([lambert, facets], axis=1), root * light[row], ([0, 0], [np.inf, 1]), tol=1e-14
+            root[:, None] * np.stack([lambert, facets], axis=1), root * light[row], ([0, 0], [np.inf, most]), tol=1e-14
         )
         np.testing.assert_allclose([diffuse[row], specular[row]], best.x, atol=1e-5)
         assert errors[row] == pytest.approx(2 * best.cost, rel=1e-6, abs=1e-6)
-        reached.add((diffuse[row] > 0, specular[row] > 0, specular[row] < 1))
+        reached.add((diffuse[row] > 0, specular[row] > 0, specular[row] < most))
     assert len(reached) >= 5
+    alone = _fit_lobes(light, weights, np.zeros(9), facets, most)  # a metal
+    assert not alone[1].any()
+    for row in range(len(light)):
+        root = np.sqrt(weights[row])
+        best = lsq_linear((root * facets)[:, None], root * light[row], (0, most), tol=1e-14)
+        assert alone[2][row] == pytest.approx(best.x[0], abs=1e-5)
+        assert alone[0][row] == pytest.approx(2 * best.cost, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("linear", [False, True])
@@ -157,8 +182,8 @@ def test_the_field_is_asked_about_its_normals(monkeypatch, linear):
     monkeypatch.setattr(LightModel, "shade_picture", answer)
     model = light_model(linear=linear)
     found = read_material(Gaussians.from_numpy(splats(5)), model, WHITE, "srgb")
-    np.testing.assert_allclose(found.diffuse, np.tile(KNOWN[0][0], (5, 1)), atol=2e-3)
-    np.testing.assert_allclose(found.specular, 0.04, atol=2e-3)
+    np.testing.assert_allclose(found.albedo, np.tile(KNOWN[0][0], (5, 1)), atol=2e-3)
+    assert not found.metallic.any()
     np.testing.assert_allclose(found.roughness, 0.2)
     assert 0.2 in ROUGHNESSES
     assert 0 < SATURATED < 1
@@ -168,27 +193,28 @@ def test_materials_do_not_depend_on_where_normals_point(run):
     turned = run.gaussians.to_numpy()
     turned["features"][:, 4:7] = np.random.default_rng(8).normal(size=(30, 3))
     other = read_material(Gaussians.from_numpy(turned), run.light, np.ones(3), "srgb")
-    for name in ("diffuse", "specular", "roughness"):
+    for name in ("albedo", "metallic", "roughness"):
         assert np.array_equal(getattr(run.material, name), getattr(other, name))
     assert np.ptp(other.albedo) > 0
     assert run.albedo_is_relative
 
 
 def test_a_picture_of_one_material_shows_it_wherever_there_is_something(run):
-    rows = {"diffuse": (0.1, 0.2, 0.3), "specular": (0.4, 0.3, 0.2)}
-    constant = {name: np.tile(np.float32(row), (30, 1)) for name, row in rows.items()}
-    run.__dict__["material"] = FittedMaterial(**constant, roughness=np.full(30, 0.25, np.float32))
+    albedo = np.tile(np.float32([0.5, 0.4, 0.3]), (30, 1))
+    run.__dict__["material"] = FittedMaterial(albedo, np.ones(30, np.float32), np.full(30, 0.25, np.float32))
     view = run.draw_material(CAMERA)
     seen = view.alpha > 0
     assert seen.any()
     assert not seen.all()
-    np.testing.assert_allclose(view.albedo[seen], 0.5, atol=1e-5)
+    np.testing.assert_allclose(view.albedo[seen], np.tile([0.5, 0.4, 0.3], (seen.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(view.metallic[seen], 1, atol=1e-5)
     np.testing.assert_allclose(view.roughness[seen], 0.25, atol=1e-5)
     assert not view.albedo[~seen].any()
     np.testing.assert_allclose(np.linalg.norm(view.normal[seen], axis=-1), 1, atol=1e-4)
     rendering = run.render(CAMERA, sun=(0, 0))
     assert np.array_equal(rendering.albedo, view.albedo)
     assert np.array_equal(rendering.roughness, view.roughness)
+    assert np.array_equal(rendering.metallic, view.metallic)
 
 
 def test_learned_normals_are_those_of_the_side_that_is_seen(tmp_path):
