@@ -179,7 +179,7 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
         from spacesim.splat.compose import ComposedRun
 
         scene = load_scene(path)
-        return PredictedRun(ComposedRun(scene.posed_at(0.0), path), scene.earth)
+        return PredictedRun(ComposedRun(scene.posed_at(0.0), path), scene.earth_at(0.0))
     if spp is not None and not 1 <= spp <= 1_000_000:
         raise InputError(f"spp: expected 1 to 1,000,000, found {spp}")
     return TracedScene(read_scene(what), spp)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from browser import PATIENCE
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
@@ -67,6 +68,13 @@ def test_keyframes_may_hold_the_scene(renderer, state, path):
     assert middle.composition.models[0].pose.translation == pytest.approx([0, 0.5, 1])
     assert middle.sun.direction == pytest.approx([np.sqrt(0.5), 0, np.sqrt(0.5)])
     assert longer.without_last().keyframes == path.keyframes
+    lit = replace(other, sun=replace(other.sun, earth=Earth([0.0, 1, 0], 60.0)))
+    longer = longer.with_keyframe(keyframe_view(view_from([-5.0, 0, 1]), CENTRE), lit, names, 1.0)
+    assert longer.at(renderer.composition, 6.0).sun.earth == lit.sun.earth
+    only = CameraPath((Keyframe(0.0, earth=lit.sun.earth),))
+    assert only.moves_scene
+    shown = only.at(renderer.composition, 0.0, state.sun).sun
+    assert (shown.direction.tolist(), shown.earth) == (state.sun.direction.tolist(), lit.sun.earth)
     assert not CameraPath(path.keyframes[:1]).moves_scene
 
 
