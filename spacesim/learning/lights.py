@@ -110,16 +110,18 @@ def predict_light(
     return added_light(seen, run.predict(camera, without, exposure=exposure)) if light == "earth" else seen
 
 
-def sunlit_frames(dataset: Dataset) -> list[int]:
+def sunlit_frames(dataset: Dataset, whole: bool = False) -> list[int]:
     """Which training frames a method that takes the Sun trains on: not those whose Sun the Earth hides; a sentence says
-    how many. Raises InputError where it hides every one."""
-    frames = dataset.train
-    sunlit = [number for number, frame in enumerate(frames) if frame.sun is None or not frame.sun.is_hidden]
+    how many. whole: nor those of whose Sun it hides a part. Raises InputError where none stays."""
+    frames, part = dataset.train, ", whole or in part" if whole else ""
+    suns = [frame.sun for frame in frames]
+    sunlit = [k for k, sun in enumerate(suns) if not (sun and (sun.visible_share < 1 if whole else sun.is_hidden))]
     if not sunlit:
-        raise InputError(f"{dataset.root}: expected a training frame whose Sun the Earth does not hide, found none")
+        expected = f"expected a training frame whose Sun the Earth does not hide{part}"
+        raise InputError(f"{dataset.root}: {expected}, found none")
     if len(sunlit) < len(frames):
         dark = len(frames) - len(sunlit)
-        log.warning("%d of %d training frames are left out: the Earth hides their Sun", dark, len(frames))
+        log.warning("%d of %d training frames are left out: the Earth hides their Sun%s", dark, len(frames), part)
     return sunlit
 
 

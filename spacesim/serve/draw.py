@@ -175,21 +175,25 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
             raise InputError(f"spp: expected with a scene, found {spp} with {what}, which is not path-traced")
         if not is_composed:
             run = load_run(path)
-            return PredictedRun(run, _earth_of(Path(run.config["data"]["path"])))
+            return PredictedRun(run, _earth_of(run))
         from spacesim.splat.compose import ComposedRun
 
         scene = load_scene(path)
-        return PredictedRun(ComposedRun(scene.posed_at(0.0), path), scene.earth)
+        return PredictedRun(ComposedRun(scene.posed_at(0.0), path), scene.earth_at(0.0))
     if spp is not None and not 1 <= spp <= 1_000_000:
         raise InputError(f"spp: expected 1 to 1,000,000, found {spp}")
     return TracedScene(read_scene(what), spp)
 
 
-def _earth_of(data: Path) -> Earth | None:
-    """The one that all frames of the dataset of a run name; None where that is gone, or they name none or several."""
+def _earth_of(run: "Predictor") -> Earth | None:
+    """The one that all frames of the dataset of a run name; None where that is gone, or they name none or several,
+    which a sentence says of a run that these hide the Sun from."""
     from spacesim.data.store import read_dataset
 
+    data = Path(run.config["data"]["path"])
     if not (data / "transforms.json").is_file():
         return None
     earths = {frame.sun.earth if frame.sun else None for frame in read_dataset(data).frames}
+    if len(earths) > 1 and run.relightable and not run.knows_earth:
+        _log.warning("serve: the frames of %s name several Earths, none of which hides the Sun here", data)
     return earths.pop() if len(earths) == 1 else None

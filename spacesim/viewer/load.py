@@ -38,10 +38,10 @@ def load_setup(path: Path, data: Path | None = None, out: Path | None = None) ->
         elif folders[0] is not None:
             dataset = read_dataset(folders[0])
     poses = tuple(placed.pose for placed in scene.posed_at(0.0).models)
-    sun = scene.sun_at(0.0) or _initial_sun(dataset)
+    sun, earth = scene.sun_at(0.0) or _initial_sun(dataset), scene.earth_at(0.0)
     return ViewerSetup(
         SceneRenderer(composition),
-        SceneState(poses, replace(sun, earth=scene.earth) if scene.earth else sun),
+        SceneState(poses, replace(sun, earth=earth) if earth else sun),
         tuple(folders),
         dataset,
         out or Path(),

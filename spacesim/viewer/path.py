@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spacesim.data.geometry import Array
-from spacesim.data.records import Camera
+from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import GaussianComposition
 from spacesim.splat.compose.path import FPS, MAX_FRAMES, CameraView, Keyframe, Orbit
 from spacesim.splat.compose.posed_scene import PosedScene, SceneFrame
@@ -95,9 +95,9 @@ class CameraPath:
         """Without anything that moves."""
         return replace(self, keyframes=(), orbit=None, frames=None)
 
-    def at(self, composition: GaussianComposition, when: float) -> SceneFrame:
-        """Camera, Sun (None where no keyframe names one) and poses at a time."""
-        scene = PosedScene(composition, None, self.image, self.keyframes, self.orbit, self.picture_count, self.fps)
+    def at(self, composition: GaussianComposition, when: float, sun: Sun | None = None) -> SceneFrame:
+        """Camera, Sun (`sun` and its Earth where no keyframe names one) and poses at a time."""
+        scene = PosedScene(composition, sun, self.image, self.keyframes, self.orbit, self.picture_count, self.fps)
         return scene.at(when, min(when * self.fps / self.picture_count, 1.0) if self.orbit else 0.0)
 
     @property
@@ -107,8 +107,8 @@ class CameraPath:
 
     @property
     def moves_scene(self) -> bool:
-        """Whether a keyframe says where the Sun or a model is."""
-        return any(key.sun is not None or key.poses for key in self.keyframes)
+        """Whether a keyframe says where the Sun, the Earth or a model is."""
+        return any(key.sun is not None or key.earth is not None or key.poses for key in self.keyframes)
 
     @property
     def description(self) -> str:

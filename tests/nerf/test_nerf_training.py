@@ -252,25 +252,29 @@ def _turned(camera):
     return replace(camera, world_from_camera=pose)
 
 
-def limb_before(sun) -> Earth:
-    """An Earth that leaves a part of the Sun."""
+def limb_before(sun, deg=0.05) -> Earth:
+    """An Earth that leaves a part of the Sun: its limb is so far beyond the Sun's centre."""
     earth = Earth(sun.direction + np.array([0, 0, 1.0]))
-    return replace(earth, angular_radius_deg=np.degrees(np.arccos(earth.direction @ sun.direction)) + 0.05)
+    return replace(earth, angular_radius_deg=np.degrees(np.arccos(earth.direction @ sun.direction)) + deg)
 
 
 def test_frames_whose_sun_the_earth_hides_are_left_out(dataset, caplog):
-    """Of a field that takes the Sun."""
-    first, *others = dataset.train
+    """Of a field that takes the Sun, also where only a part of it is hidden."""
+    first, second, *others = dataset.train
     night = replace(first, sun=replace(first.sun, earth=Earth(first.sun.direction)))
-    box, darker = scene_box(dataset, CONFIG.margin), replace(dataset, train=(night, *others))
+    dim = replace(second, sun=replace(second.sun, earth=limb_before(second.sun, -0.05)))
+    assert 0.5 < dim.sun.visible_share < 1
+    box, darker = scene_box(dataset, CONFIG.margin), replace(dataset, train=(night, dim, *others))
     lit = training_pixels(replace(dataset, train=tuple(others)), box, suns=True)
     used = training_pixels(darker, box, suns=True)
-    assert f"1 of {len(dataset.train)} training frames are left out: the Earth hides their Sun" in caplog.text
+    left = f"2 of {len(dataset.train)} training frames are left out"
+    assert f"{left}: the Earth hides their Sun, whole or in part" in caplog.text
     for name in ("color", "view", "cameras", "suns"):
         np.testing.assert_array_equal(np.array(getattr(used, name)), np.array(getattr(lit, name)))
     assert len(training_pixels(darker, box, suns=False).color) > len(used.color)
-    with pytest.raises(InputError, match="expected a training frame whose Sun the Earth does not hide, found none"):
-        training_pixels(replace(dataset, train=(night,)), box, suns=True)
+    for frame in (night, dim):
+        with pytest.raises(InputError, match="whose Sun the Earth does not hide, whole or in part, found none"):
+            training_pixels(replace(dataset, train=(frame,)), box, suns=True)
 
 
 def test_a_field_that_takes_the_sun_as_input(dataset, tmp_path):

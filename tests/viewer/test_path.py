@@ -2,18 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path as FilePath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from browser import PATIENCE
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose import Keyframe, Orbit, Pose, scenefile
 from spacesim.splat.compose.posed_scene import PosedScene
 from spacesim.viewer.load import load_setup
-from spacesim.viewer.panels.paths import file_for
+from spacesim.viewer.panels.paths import PathControls, file_for
 from spacesim.viewer.path import (
     REFERENCE,
     CameraPath,
@@ -24,7 +26,7 @@ from spacesim.viewer.path import (
     scene_to_save,
     vertical_fov,
 )
-from spacesim.viewer.state import SceneState, ViewerCamera
+from spacesim.viewer.state import SceneState, SharedScene, ViewerCamera
 
 CENTRE = np.zeros(3)
 
@@ -67,7 +69,26 @@ def test_keyframes_may_hold_the_scene(renderer, state, path):
     assert middle.composition.models[0].pose.translation == pytest.approx([0, 0.5, 1])
     assert middle.sun.direction == pytest.approx([np.sqrt(0.5), 0, np.sqrt(0.5)])
     assert longer.without_last().keyframes == path.keyframes
+    lit = replace(other, sun=replace(other.sun, earth=Earth([0.0, 1, 0], 60.0)))
+    longer = longer.with_keyframe(keyframe_view(view_from([-5.0, 0, 1]), CENTRE), lit, names, 1.0)
+    assert longer.at(renderer.composition, 6.0).sun.earth == lit.sun.earth
+    only = CameraPath((Keyframe(0.0, earth=lit.sun.earth),))
+    assert only.moves_scene
+    shown = only.at(renderer.composition, 0.0, state.sun).sun
+    assert (shown.direction.tolist(), shown.earth) == (state.sun.direction.tolist(), lit.sun.earth)
     assert not CameraPath(path.keyframes[:1]).moves_scene
+
+
+def test_a_path_that_is_played_moves_the_earth_where_there_is_one(renderer, state):
+    """Not where its box is off."""
+    moved, shown = Earth([0.0, 1, 0], 60.0), list[SceneState]()
+    path = CameraPath((Keyframe(0.0, earth=moved),))
+    for earth in (Earth([0, 0, -1.0]), None):
+        shared = SharedScene(replace(state, sun=replace(state.sun, earth=earth)))
+        controls = SimpleNamespace(_renderer=renderer, _shared=shared, _put=shown.append)
+        PathControls._show(controls, path, None, 0.0)
+    assert [one.sun.earth for one in shown] == [moved, None]
+    assert [one.sun.direction.tolist() for one in shown] == [state.sun.direction.tolist()] * 2
 
 
 def same_path(one, other, atol=1e-12):

@@ -37,7 +37,8 @@ class Pixels:
 
 
 def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
-    """Of a dataset's training pictures. suns: each must name its Sun, and those of `sunlit_frames` are taken.
+    """Of a dataset's training pictures. suns: each must name its Sun, and those of `sunlit_frames` are taken
+    that see all of it: the loss compares with full sunlight.
 
     Raises InputError where no ray of a pixel that counts crosses the box, for a picture without a Sun, and where
     `sunlit_frames` does; MemoryError where the pixels do not fit.
@@ -51,7 +52,7 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
                 f"no Sun, found none in {frame.file_path}"
             )
     if suns:
-        dataset = replace(dataset, train=tuple(dataset.train[number] for number in sunlit_frames(dataset)))
+        dataset = replace(dataset, train=tuple(dataset.train[number] for number in sunlit_frames(dataset, whole=True)))
     parts: list[tuple[np.ndarray, ...]] = []
     outside: list[str] = []
     for number, frame in enumerate(dataset.train):

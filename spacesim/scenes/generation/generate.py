@@ -1,6 +1,7 @@
 """Sweep cameras and Suns over a scene and write the dataset."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from spacesim import backend
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json, write_json
 from spacesim.data.geometry import Array, angles_from_direction
@@ -318,6 +320,8 @@ class _DatasetPlan:
             keys["objects"] = moves
         if (lit_by := self._earth_in(name, view)) is not None:
             keys |= earth_keys(lit_by.light)
+        elif view.earth is not None:
+            keys |= earth_keys(_dark_earth(view.earth))
         return {key: value for key, value in {**keys, "sun_visibility": visible}.items() if value is not None}
 
 
@@ -326,6 +330,12 @@ def _place_of(earth: Array) -> dict[str, float]:
     azimuth, elevation = angles_from_direction(earth)
     altitude = float(np.linalg.norm(earth)) * 1e-3 - EARTH_RADIUS_KM
     return {"azimuth_deg": azimuth, "elevation_deg": elevation, "altitude_km": altitude}
+
+
+def _dark_earth(earth: Array) -> Earth:
+    """One that hides the Sun and gives no light, of the vector [3] to its centre, metres."""
+    radius = math.asin(1e3 * EARTH_RADIUS_KM / float(np.linalg.norm(earth)))
+    return Earth(earth, math.degrees(radius), albedo=0.0)
 
 
 def plan_views(scene: Scene, config: SceneConfig) -> tuple[NamedViews, NamedViews]:

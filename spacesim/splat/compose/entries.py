@@ -84,22 +84,27 @@ class SunEntry:
 
 @dataclass(frozen=True)
 class EarthEntry(SunEntry):
-    """Where the Earth is, as `SunEntry` says it of the Sun, and what it is like."""
+    """Where the Earth is, as `SunEntry` says it of the Sun, and what it is like; None: as the scene's own, else as
+    `Earth` has it."""
 
-    angular_radius_deg: float = Earth.angular_radius_deg  #: degrees, see `Earth`
-    albedo: float = Earth.albedo  #: see `Earth`
+    angular_radius_deg: float | None = None  #: degrees, see `Earth`
+    albedo: float | None = None  #: see `Earth`
 
     def __post_init__(self) -> None:
         super().__post_init__()
         try:
-            self.earth  # noqa: B018  checks the numbers
+            self.earth()
         except InputError as error:
             raise InputError(str(error).removeprefix("earth_")) from None
 
-    @property
-    def earth(self) -> Earth:
-        """The record."""
-        return Earth(self.sun.direction, self.angular_radius_deg, self.albedo)
+    def earth(self, base: Earth | None = None) -> Earth:
+        """`base`, the scene's own, with what is said. Raises InputError that begins with the key."""
+        direction = self.sun.direction
+        own = base or Earth(direction)
+        radius, albedo = self.angular_radius_deg, self.albedo
+        return Earth(
+            direction, own.angular_radius_deg if radius is None else radius, own.albedo if albedo is None else albedo
+        )
 
 
 @dataclass(frozen=True)
@@ -194,6 +199,7 @@ class KeyframeEntry:
 
     time: float  #: seconds
     sun: SunEntry | None = None  #: None: not named here
+    earth: EarthEntry | None = None  #: None: not named here
     camera: ViewEntry | None = None  #: None: not named here
     models: Mapping[str, PoseEntry] = field(default_factory=dict)  #: poses by the models' names
 
@@ -209,7 +215,7 @@ class SceneEntry:
     shadows: str = ComposeConfig.shadows  #: of models on each other, see `ComposeConfig`
     frames: int | None = None  #: pictures; None: up to the last keyframe, 120 of an orbit, else 1
     fps: float = FPS  #: pictures a second
-    keyframes: tuple[KeyframeEntry, ...] = ()  #: of camera, Sun and models
+    keyframes: tuple[KeyframeEntry, ...] = ()  #: of camera, Sun, Earth and models
 
     def __post_init__(self) -> None:
         if not self.models:

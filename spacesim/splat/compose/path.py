@@ -1,4 +1,4 @@
-"""What changes with time in a scene: keyframes of poses, Sun and camera, what is between them, and orbits."""
+"""What changes with time in a scene: keyframes of poses, Sun, Earth and camera, what is between them, and orbits."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, direction_from_angles, look_at, normalize
 from spacesim.data.records import Camera, Sun
@@ -60,6 +61,11 @@ class Keyframe:
     sun: Sun | None = None  #: None: not named here
     view: CameraView | None = None  #: where the camera stands; None: not named here
     poses: Mapping[str, Pose] = field(default_factory=dict)  #: by the names of models
+    earth: Earth | None = None  #: None: that of `sun`, or not named here
+
+    def __post_init__(self) -> None:
+        if self.sun is not None and self.earth is None:
+            object.__setattr__(self, "earth", self.sun.earth)
 
 
 @dataclass(frozen=True)
@@ -108,6 +114,14 @@ class KeyframeTrack(Generic[T]):
 def interpolate_sun(first: Sun, second: Sun, share: float) -> Sun:
     """On the great circle from one to the other."""
     return Sun(slerp(first.direction, second.direction, share))
+
+
+def interpolate_earth(first: Earth, second: Earth, share: float) -> Earth:
+    """Its direction on the great circle from one to the other, its angular radius and albedo along a line."""
+    radius, albedo = (
+        (1 - share) * getattr(first, name) + share * getattr(second, name) for name in ("angular_radius_deg", "albedo")
+    )
+    return Earth(slerp(first.direction, second.direction, share), radius, albedo)
 
 
 def interpolate_view(first: CameraView, second: CameraView, share: float) -> CameraView:

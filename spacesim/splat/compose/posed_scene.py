@@ -16,6 +16,7 @@ from spacesim.splat.compose.path import (
     Keyframe,
     KeyframeTrack,
     Orbit,
+    interpolate_earth,
     interpolate_sun,
     interpolate_view,
 )
@@ -42,11 +43,11 @@ class PosedScene:
     composition: GaussianComposition  #: runs with their poses
     sun: Sun | None = None  #: None where it names none
     camera: Camera | None = None  #: None where it names none
-    keyframes: Sequence[Keyframe] = ()  #: of camera, Sun and models, by time
+    keyframes: Sequence[Keyframe] = ()  #: of camera, Sun, Earth and models, by time
     orbit: Orbit | None = None  #: on which the camera flies
     frames: int = 1  #: pictures, 1 / fps seconds apart
     fps: float = FPS  #: pictures a second
-    earth: Earth | None = None  #: that the Sun lights at all times, where a Sun does not name its own
+    earth: Earth | None = None  #: that the Sun lights, where neither keyframes nor a Sun name another
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda key: key.time)))
@@ -85,15 +86,20 @@ class PosedScene:
         whose = str(composition.path or "the scene")
         towards = checked_sun(self.sun_at(time) if sun is None else sun, composition.relightable, whose)
         if not isinstance(sun, Sun):
-            towards = self._with_earth(towards)
+            towards = self._with_earth(towards, time)
         return Rendering(composition, camera, towards, exposure, light)
 
     def sun_at(self, time: float) -> Sun | None:
         """The Sun at a time, seconds; None where none is given."""
-        return self._with_earth(self._track(lambda key: key.sun, interpolate_sun, time) or self.sun)
+        return self._with_earth(self._track(lambda key: key.sun, interpolate_sun, time) or self.sun, time)
 
-    def _with_earth(self, sun: Sun | None) -> Sun | None:
-        return sun if sun is None or sun.earth or self.earth is None else replace(sun, earth=self.earth)
+    def earth_at(self, time: float) -> Earth | None:
+        """The Earth at a time, seconds; None where none is given."""
+        moved = self._track(lambda key: key.earth, interpolate_earth, time)
+        return moved or (self.sun.earth if self.sun else None) or self.earth
+
+    def _with_earth(self, sun: Sun | None, time: float) -> Sun | None:
+        return None if sun is None else replace(sun, earth=self.earth_at(time))
 
     def posed_at(self, time: float) -> GaussianComposition:
         """The models where they are at a time, seconds."""

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from spacesim.data import toml
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, as_path, write_bytes
 from spacesim.data.geometry import OPENCV_FROM_OPENGL, look_at
@@ -56,11 +57,12 @@ def load_scene(
     width = camera.width if camera else RESOLUTION[0]
     keyframes = [_keyframe(keyframe, k, entry, models, width, document) for k, keyframe in enumerate(entry.keyframes)]
     orbit = entry.camera.orbit if entry.camera else None
-    sun, earth = entry.sun.sun if entry.sun else None, entry.earth.earth if entry.earth else None
-    if earth and not any(model.run.relightable for model in models):
-        where = document.label(("earth",))
-        raise InputError(f"{where}: expected a model that the Sun relights, found none")
-    if earth and (without := [model.name for model in models if not model.run.knows_earth]):
+    sun, earth = entry.sun.sun if entry.sun else None, entry.earth.earth() if entry.earth else None
+    named: list[tuple[str | int, ...]] = [("earth",)] if earth else []
+    named += [("keyframes", k, "earth") for k, keyframe in enumerate(entry.keyframes) if keyframe.earth]
+    if named and not any(model.run.relightable for model in models):
+        raise InputError(f"{document.label(named[0])}: expected a model that the Sun relights, found none")
+    if named and (without := [model.name for model in models if not model.run.knows_earth]):
         log.info("%s: has not learned the Earth's light; it can but hide the Sun", ", ".join(without))
     return PosedScene(composition, sun, camera, keyframes, orbit, _frames(entry, document), entry.fps, earth)
 
@@ -83,12 +85,12 @@ def save_scene(path: Path, scene: PosedScene) -> None:
     if scene.sun is not None:
         values["sun"] = _sun_values(scene.sun)
     earth = (scene.sun and scene.sun.earth) or scene.earth
-    if earth is not None and any(model.run.relightable for model in scene.composition.models):
-        values["earth"] = _sun_values(Sun(earth.direction))
-        values["earth"] |= {"angular_radius_deg": float(earth.angular_radius_deg), "albedo": float(earth.albedo)}
+    dims = any(model.run.relightable for model in scene.composition.models)
+    if earth is not None and dims:
+        values["earth"] = _earth_values(earth)
     if scene.camera is not None:
         values["camera"] = _camera_values(scene.camera, scene.orbit)
-    values["keyframes"] = [_keyframe_values(key) for key in scene.keyframes]
+    values["keyframes"] = [_keyframe_values(key, dims) for key in scene.keyframes]
     text = toml.dump({key: value for key, value in values.items() if value != []})
     write_bytes(path, text.encode())
 
@@ -180,7 +182,8 @@ def _keyframe(
         if view is None:
             raise InputError(f"{label}: expected position and look_at, or transform_matrix, found neither")
     poses = {name: pose.pose(by_name[name].pose) for name, pose in keyframe.models.items()}
-    return Keyframe(keyframe.time, keyframe.sun.sun if keyframe.sun else None, view, poses)
+    sun, still = keyframe.sun.sun if keyframe.sun else None, entry.earth.earth() if entry.earth else None
+    return Keyframe(keyframe.time, sun, view, poses, keyframe.earth.earth(still) if keyframe.earth else None)
 
 
 def _frames(entry: SceneEntry, document: toml.Document) -> int:
@@ -219,6 +222,11 @@ def _sun_values(sun: Sun) -> JsonDict:
     return {"direction": sun.direction.tolist()}
 
 
+def _earth_values(earth: Earth) -> JsonDict:
+    values = _sun_values(Sun(earth.direction))
+    return values | {"angular_radius_deg": float(earth.angular_radius_deg), "albedo": float(earth.albedo)}
+
+
 def _view_values(view: CameraView) -> JsonDict:
     values: JsonDict = {"transform_matrix": (view.world_from_camera @ OPENCV_FROM_OPENGL).tolist()}
     position = view.world_from_camera[:3, 3]
@@ -248,10 +256,12 @@ def _camera_values(camera: Camera, orbit: Orbit | None) -> JsonDict:
     }
 
 
-def _keyframe_values(key: Keyframe) -> JsonDict:
+def _keyframe_values(key: Keyframe, with_earth: bool) -> JsonDict:
     values: JsonDict = {"time": float(key.time)}
     if key.sun is not None:
         values["sun"] = _sun_values(key.sun)
+    if key.earth is not None and with_earth:
+        values["earth"] = _earth_values(key.earth)
     if key.view is not None:
         values["camera"] = _view_values(key.view)
     if key.poses:

@@ -21,8 +21,8 @@ class LightConfig:
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
     #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
     bounce: int = 0
-    #: add what the Earth gives; none: where every training picture names its Earth and the field has normals, as
-    #: `train` finds out
+    #: add what the Earth gives; none: where every training picture names an Earth whose albedo is not 0 and the
+    #: field has normals, as `train` finds out
     earth: bool | None = None
     #: colours are linear, shares of what is white, and blended as such, and pictures go through the tone curve
     #: afterwards; else they are sRGB values, as in the thesis (section 7.2 asks for the former)

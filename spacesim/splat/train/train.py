@@ -113,13 +113,15 @@ def _trainer_of_poses(
 
 def _with_light_of(config: TrainConfig, dataset: Dataset) -> TrainConfig:
     """What the configuration leaves to the dataset: whether the Earth is a part of the light; the tone curve and the
-    exposure of linear colours. Raises InputError where the Earth is asked for and a frame names none."""
+    exposure of linear colours. Raises InputError where the Earth is asked for and a frame names none that gives
+    light."""
     light = config.light
     if light is None:
         return config
-    dark = next((f.file_path for f in dataset.train if f.sun is None or f.sun.earth is None), None)
+    earths = ((frame.file_path, frame.sun.earth if frame.sun else None) for frame in dataset.train)
+    dark = next((path for path, earth in earths if earth is None or earth.albedo == 0), None)
     if light.earth and dark is not None:
-        expected = "expected earth_direction in every training frame (light.earth = true)"
+        expected = "expected earth_direction in every training frame (light.earth = true), with earth_albedo above 0"
         raise InputError(f"{dataset.root}: {expected}, found none in {dark}")
     if light.field.surface and dark is None and light.earth is None:
         light = replace(light, earth=True)

@@ -21,7 +21,7 @@ SAMPLES = (4, 256)  #: of the path tracer, a pixel
 
 class SunControls:
     """Azimuth and elevation as sliders; they follow the Sun that is dragged. Nothing where no Sun matters. A box where
-    an Earth is named: it stays where the data or the scene have it."""
+    an Earth is named: it stays where the data, the scene or its keyframes have it."""
 
     def __init__(self, gui: "viser.GuiApi", shared: SharedScene) -> None:
         self._shared = shared
@@ -40,17 +40,21 @@ class SunControls:
 
     def drag(self, sun: Sun) -> None:
         """The Sun was moved by other means, the Earth, too, where it names one."""
-        self._named = self._named and (sun.earth or self._named)
+        self._name(sun)
         lit = self._with_earth(sun)
         self._shared.change(lambda state: replace(state, sun=lit))
         self.follow(lit)
 
     def follow(self, sun: Sun) -> None:
         """Put the sliders where the Sun is."""
+        self._name(sun)
         azimuth, elevation = sun.angles
         self.azimuth.value, self.elevation.value = round(azimuth, 1) % 360, round(elevation, 1)
         if self.earth is not None:
             self.earth.value = sun.earth is not None
+
+    def _name(self, sun: Sun) -> None:
+        self._named = self._named and (sun.earth or self._named)
 
     def _with_earth(self, sun: Sun) -> Sun:
         return Sun(sun.direction, self._named if self.earth is not None and self.earth.value else None)

@@ -135,14 +135,14 @@ class PathControls:
 
     def _show(self, path: CameraPath, client: Client, when: float) -> None:
         """A moment of the path: the client's camera, and the scene where keyframes say how it stands."""
-        shot = path.at(self._renderer.composition.posed(self._shared.state.poses), when)
+        now = self._shared.state
+        shot = path.at(self._renderer.composition.posed(now.poses), when, now.sun)
         if path.moves_camera:
             client.look_from(shot.camera.world_from_camera, vertical_fov(shot.camera))
         if path.moves_scene:
             poses = tuple(placed.pose for placed in shot.composition.models)
-            now = self._shared.state.sun
-            sun = now if shot.sun is None else Sun(shot.sun.direction, now.earth if now else None)
-            self._put(SceneState(poses, sun))
+            sun, has_earth = shot.sun, now.sun is not None and now.sun.earth is not None
+            self._put(SceneState(poses, sun if sun is None or has_earth else Sun(sun.direction)))
 
 
 class FileControls:

@@ -33,7 +33,7 @@ class TraceRequest:
     number: int  #: given back with answers
     scene: SceneConfig  #: what is traced
     camera: Camera  #: pose and intrinsics
-    sun: Sun  #: that lights it
+    sun: Sun  #: that lights it; the Earth that it names hides it where the scene has none
     samples: int  #: a pixel
     mode: str  #: whose planes: "colour" asks for paths, the others for labels
     models: Sequence[int] = ()  #: see `model_ids`
@@ -61,8 +61,10 @@ class Tracer:
         """One answer after another, each of more samples than the one before."""
         renderer = self._loaded(request.scene)
         camera, sun, config = request.camera, request.sun, request.scene.camera
+        left = sun.visible_share if request.scene.earth is None else 1.0  # a scene's own Earth is traced
         if request.mode not in ("colour", "ellipsoids", "accumulation"):
             labels = renderer.labels(camera, sun)
+            labels["sun_visibility"] = np.float32(left) * labels["sun_visibility"]
             yield TraceResult(request.number, _label_planes(labels, request.models), 1, True)
             return
         total, weight, done = np.zeros(()), np.zeros(()), 0
@@ -70,7 +72,7 @@ class Tracer:
             radiance, alpha = renderer.radiance(camera, sun, (request.scene.seed, done))
             total, weight, done = total + radiance.astype(np.float64), weight + alpha.astype(np.float64), done + PASS
             share = PASS / done
-            planes = _picture(total * share, weight * share, config)
+            planes = _picture(left * total * share, weight * share, config)
             yield TraceResult(request.number, planes, done, done >= request.samples)
 
     def _loaded(self, scene: SceneConfig) -> "Renderer":

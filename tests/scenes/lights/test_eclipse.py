@@ -124,6 +124,8 @@ def test_frames_through_the_penumbra(tmp_path, caplog, lit_by_earth):
     assert seen == pytest.approx(expected, abs=1e-6)
     assert [seen[0], seen[3]] == [1, 0]
     data = read_dataset(tmp_path / "data")
+    assert [frame.sun.visible_share for frame in data.train] == pytest.approx(expected, abs=1e-6)
+    assert {frame["earth_albedo"] for frame in frames} == {0.0}
     truths = [load_truth(data, frame) for frame in data.train]
     light = np.array([truth.radiance.sum() for truth in truths])
     np.testing.assert_allclose(light / light[0], seen, atol=0.02)

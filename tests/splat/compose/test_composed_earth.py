@@ -119,6 +119,40 @@ def test_a_scene_file_names_it(scene_file, tmp_path):
         assert load_scene(tmp_path / "again.toml").sun_at(0.0).earth == EARTH
 
 
+def test_keyframes_move_it(scene_file, tmp_path, monkeypatch):
+    """On a great circle between those that name it, beside a Sun that stands still; what they do not say of it is as
+    [earth] has it, if there is one."""
+    sunwards = SUN.direction.tolist()
+    keys = (
+        "[[keyframes]]\ntime = 0\nearth = { azimuth_deg = 40, elevation_deg = -55 }\n"
+        f"[[keyframes]]\ntime = 2\n[keyframes.earth]\ndirection = {sunwards}\nangular_radius_deg = 40\nalbedo = 0\n"
+    )
+    scene_file.write_text(f"fps = 1\n{SCENE}{keys}")
+    scene = load_scene(scene_file)
+    shots = [scene.frame(k).sun for k in range(3)]
+    assert [sun.direction.tolist() for sun in shots] == [sunwards] * 3
+    earths = [sun.earth for sun in shots]
+    assert earths[0] == Earth(Sun.from_angles(40, -55).direction, 60.0, 0.9)
+    assert earths[2] == Earth(SUN.direction, 40.0, 0.0)
+    np.testing.assert_allclose(earths[1].direction, Sun.from_angles(40, -10).direction, atol=1e-12)
+    assert (earths[1].angular_radius_deg, earths[1].albedo) == (50, 0.45)
+    assert [sun.visible_share for sun in shots] == [1, 0, 0]  # 90, 45 and 0 degrees beside radii of 60, 50 and 40
+    assert scene.render(time=2.0).rgb.max() == 0 < scene.render(time=0.0).rgb.max()
+    save_scene(tmp_path / "again.toml", scene)
+    again = load_scene(tmp_path / "again.toml")
+    assert [again.frame(k).sun.earth for k in range(3)] == earths
+    own = [Keyframe(0.0, BOTH), Keyframe(1.0, replace(SUN, earth=earths[0]))]
+    moving = PosedScene(scene.composition, None, scene.camera, own, frames=3, fps=2.0)
+    assert [moving.frame(k).sun.earth for k in (0, 2)] == [EARTH, earths[0]]
+    assert moving.frame(1).sun.earth.albedo == 0.9
+    before, _, after = SCENE.partition("[earth]")
+    scene_file.write_text(before + after[after.index("[camera]") :] + keys)
+    assert load_scene(scene_file).earth_at(0.0) == Earth(earths[0].direction)
+    monkeypatch.setattr(scenefile, "load_run", lambda _path: disc_run(1.0))
+    with pytest.raises(InputError, match=r"keyframes\[0\].earth: expected a model that the Sun relights, found none"):
+        load_scene(scene_file)
+
+
 @pytest.mark.parametrize(("run", "saved"), [(made_run("map"), True), (disc_run(1.0), False)], ids=("relit", "plain"))
 def test_what_changes_no_model_is_not_saved(tmp_path, run, saved):
     """To one that has not learned its light it hides the Sun."""

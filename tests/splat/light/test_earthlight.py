@@ -320,6 +320,24 @@ def test_a_served_run_says_that_it_is_left_out(run, earthlit, caplog):
         served = load_served(run.path)
     assert served.earth is None
     assert f"{run.path} has learned the Earth's light, which is left out" in caplog.text
+    assert "several Earths" not in caplog.text
+
+
+def test_an_earth_that_gives_no_light_is_not_learned(small_lit_dataset, tmp_path, caplog):
+    """That of a trajectory; it hides the Sun."""
+    dark = [replace(f, sun=replace(f.sun, earth=Earth(-f.sun.direction, albedo=0.0))) for f in small_lit_dataset.train]
+    dataset, short = replace(small_lit_dataset, train=tuple(dark)), replace(CONFIG, iterations=1)
+    run = train(dataset, tmp_path / "run", short)
+    assert not run.knows_earth
+    frame = small_lit_dataset.test[0]
+    sun = replace(frame.sun, earth=Earth(frame.sun.direction, albedo=0.0))
+    assert run.predict(frame.camera, sun).rgb.max() == 0 < run.predict(frame.camera, frame.sun).rgb.max()
+    with pytest.raises(InputError, match=r"expected earth_direction .*, with earth_albedo above 0, found none in"):
+        train(dataset, tmp_path / "asked", with_settings(short, {"light.earth": True}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spacesim.data.store.read_dataset", lambda _: dataset)  # two Suns, each with an Earth opposite
+        assert load_served(run.path).earth is None
+    assert f"the frames of {dataset.root} name several Earths, none of which hides the Sun here" in caplog.text
 
 
 def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):

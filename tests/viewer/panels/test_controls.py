@@ -70,6 +70,9 @@ def test_the_earth_stays_where_the_sun_is_moved():
     assert shared.state.sun.earth is None
     panel.use("Earth", True)
     assert shared.state.sun.earth == EARTH
+    sun.follow(replace(SUN, earth=other))  # a path that is played
+    panel.use("Azimuth", 80)
+    assert shared.state.sun.earth == other
     sun.follow(Sun(SUN.direction))
     assert panel.handles["Earth"].value is False
 

@@ -8,8 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at, rotation_from_quaternion
+from spacesim.data.images import linear_from_srgb
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import read_dataset
 from spacesim.splat.compose import Pose
@@ -79,6 +81,23 @@ def test_the_tracer_renders_what_the_data_hold(tiny_data, scene):
     *_, many = tracer.answers(TraceRequest(3, scene, frame.camera, frame.sun, 16 * PASS, "colour"))
     errors = [np.abs(a.planes.rgb - many.planes.rgb).mean() for a in answers]
     assert 0 < errors[2] < errors[1] < errors[0]
+
+
+def test_an_earth_that_the_scene_does_not_have_dims_what_is_traced(tiny_data, scene):
+    """As it dims the pictures of a trajectory's frames."""
+    frame, tracer = read_dataset(tiny_data).frames[0], Tracer()
+    across = Earth(np.cross(frame.sun.direction, [0, 0, 1]), 89.9)
+    dim, light, seen = replace(frame.sun, earth=across), [], []
+    assert 0.2 < dim.visible_share < 0.9
+    for sun in (frame.sun, dim):
+        (labels,) = tracer.answers(TraceRequest(1, scene, frame.camera, sun, 1, "visibility"))
+        (paths,) = tracer.answers(TraceRequest(2, scene, frame.camera, sun, PASS, "colour"))
+        seen.append(labels.planes.visibility)
+        light.append(linear_from_srgb(paths.planes.rgb)[paths.planes.alpha == 1])
+    np.testing.assert_allclose(seen[1], dim.visible_share * seen[0], rtol=1e-6)
+    below_white = light[0] < 0.99
+    np.testing.assert_allclose(light[1][below_white], dim.visible_share * light[0][below_white], atol=1e-4)
+    assert light[0].max() > 0.5
 
 
 def test_objects_have_the_numbers_of_their_models(tiny_data, scene):
