@@ -31,6 +31,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.train.checkpoint import FORMAT, GaussianCheckpointHeader
 from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.discs import EVERY, turn_discs
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
@@ -120,8 +121,15 @@ class Trainer(TrainingLoop):
             self.pictures.find_suns(self.iteration, self.gaussians, self.light)
         self.strategy.add_noise(self.iteration, self.gaussians, self.means_rate(index), config.seed)
         self._refine()
+        self._turn_discs()
         losses = [result.loss for result in results]
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
+
+    def _turn_discs(self) -> None:
+        """Now and then, where light has learned their normals."""
+        light = self.config.light
+        if self.config.surfels and light and light.field.surface and self.iteration % EVERY == 0:
+            turn_discs(self.gaussians, light.field.features)
 
     def _refine(self) -> None:
         """After a step: the strategy refines the set of Gaussians, or the warm start does while it lasts."""
