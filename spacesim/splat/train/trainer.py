@@ -126,9 +126,11 @@ class Trainer(TrainingLoop):
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
     def _turn_discs(self) -> None:
-        """Now and then, where light has learned their normals."""
+        """Now and then, where light has learned their normals, which without shadows stand in for these, too."""
         light = self.config.light
-        if self.config.surfels and light and light.field.surface and self.iteration % EVERY == 0:
+        if not (self.config.surfels and light and light.shadow and light.field.surface):
+            return
+        if self.iteration % EVERY == 0:
             turn_discs(self.gaussians, light.field.features)
 
     def _refine(self) -> None:
