@@ -57,8 +57,8 @@ def test_discs_and_normals_turn_a_share_of_the_way():
 
 @pytest.mark.parametrize(("method", "surfels"), [("shadow-map", True), ("relight", True), ("shadow-map", False)])
 def test_training_draws_shape_and_light_together(small_lit_dataset, monkeypatch, method, surfels):
-    """Discs end nearer to the learned normals than where nothing turns them; left alone are what are no discs, and light
-    without shadows, for which its normals stand in."""
+    """Discs end nearer to the learned normals than where nothing turns them. What is no disc is left alone, and so is
+    light without shadows, for which its normals stand in."""
     config = replace(preset("demo", method), iterations=60, init_count=300, surfels=surfels)
     ends = []
     for every in (10, 1000):
