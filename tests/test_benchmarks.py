@@ -632,11 +632,14 @@ def test_materials_are_compared_part_by_part(command, tiny_data, place):
     report = json.loads(call(command, ended))
     rows = {row["part"]: row for row in report["parts"]}
     bus, radiator = rows["bus"], rows["radiator"]
-    assert (bus["material"], bus["true roughness"]) == ("gold-mli", 0.12)
-    assert bus["true gloss"] == pytest.approx(0.48, abs=0.02)  # the luminance of its albedo
-    assert (radiator["true gloss"], radiator["true roughness"]) == (0.04, 0.4)
+    assert (bus["material"], bus["true metal"], bus["true roughness"]) == ("gold-mli", 1, 0.12)
+    assert (radiator["true metal"], radiator["true roughness"]) == (0, 0.4)
     assert min(row["pixels"] for row in report["parts"]) >= 20
-    assert all(0 <= row["gloss"] <= row["albedo"] + 2e-3 for row in report["parts"])
+    assert all(0 <= row["metal"] <= 1 for row in report["parts"])
+    metals = [row for row in report["parts"] if row["true metal"]]
+    right = sum(row["pixels"] * row["metal"] for row in metals) / sum(row["pixels"] for row in metals)
+    assert report["told"]["metals"] == pytest.approx(right, abs=0.01)
+    assert 0 <= report["told"]["others"] <= 1
     assert all(value is None or -1 <= value <= 1 for value in report["rank"].values())
     assert report["rank"]["albedo"] is not None
 
