@@ -84,8 +84,9 @@ class PosedScene:
         camera = self.at(time).camera if camera is None else camera
         composition = self.posed_at(time)
         whose = str(composition.path or "the scene")
-        towards = checked_sun(self.sun_at(time) if sun is None else sun, composition.relightable, whose)
-        if not isinstance(sun, Sun):
+        named = self.sun_at(time) if sun is None else sun
+        towards = checked_sun(named, composition.relightable, whose)
+        if not isinstance(named, Sun):
             towards = self._with_earth(towards, time)
         return Rendering(composition, camera, towards, exposure, light)
 

@@ -128,8 +128,7 @@ class Trainer(TrainingLoop):
     def _turn_discs(self) -> None:
         """Now and then, where light has learned their normals, which without shadows stand in for these, too."""
         light = self.config.light
-        has_both = self.config.surfels and light is not None and light.field.surface and light.shadow is not None
-        if light and has_both and self.iteration % EVERY == 0:
+        if light and light.shadow and light.field.surface and self.config.surfels and self.iteration % EVERY == 0:
             turn_discs(self.gaussians, light.field.features)
 
     def _refine(self) -> None:
