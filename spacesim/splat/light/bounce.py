@@ -4,21 +4,27 @@ What faces away from the Sun, or lies in a shadow, is not black beside a lit sur
 sees. A field that takes the cosines of one Gaussian cannot know which of its neighbours are lit; visibility does.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.learning.mlp import sigmoid
-from spacesim.learning.reflectance import unit_normals
+from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.gaussians import opacities
-from spacesim.splat.raster.records import load, packets, store
+from spacesim.splat.raster.records import load, packet_sizes, packets, store
 from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
+SPECULAR = -3.0  #: logit of the specular reflectances at the start: 0.05
+ROUGHNESS = 0.15  #: GGX alpha at which surfaces mirror what others scatter (docs/research/light.md)
 OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap, albedos learn the rest
+GLASS = 0.04  #: specular reflectance of a glossy surface of refractive index 1.5
+EMITTER = 10  #: numbers of an emitter: place, normal, area, light
 MAX_EMITTER_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
 
 
@@ -37,38 +43,116 @@ class Scatterers:
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-def irradiance(scatterers: Scatterers, emitters: int, visibility: list[Float], batch: PaddedBatch) -> list[Float]:
+def irradiance(scatterers: Scatterers, emitters: list[Float], count: int, batch: PaddedBatch) -> list[Float]:
     """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
     1 where all around is as bright as a white surface under the Sun, as far as areas add up to surfaces (`OVERLAP`).
 
-    emitters: how many of the Gaussians scatter, evenly chosen by number, each in place of N / emitters;
-    visibility: [M] in a list, or nothing for 1
+    emitters: of `scattering`, `count` of them
 
-    Sum over emitters k of rho_k v_k |n_k . s| F with F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al.
-    (1989), A its area: 2 pi s_1 s_2 opacity, its two longer axes', times N / emitters, times `OVERLAP`.
+    Sum over emitters k of their light times F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al. (1989), A its
+    area.
     """
-    numbers = _emitters(scatterers, emitters, visibility, batch)
-    packed = [store(values, dr.arange(ad.UInt32, emitters), emitters) for values in packets(numbers)]
-    dr.eval(packed)
-    means = batch.repeat_last(scatterers.means)
-    normals = unit_normals(ad.Array3f(batch.block(scatterers.features, scatterers.normals, 3)))
+    means, normals = batch.repeat_last(scatterers.means), _normals(scatterers, batch)
 
     def received(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        x, y, z, nx, ny, nz, area, *light = load(packed, k, emitters)[:10]
-        away = ad.Array3f(x, y, z) - means
-        square = dr.squared_norm(away)
-        away *= dr.rsqrt(dr.maximum(square, 1e-12))
-        here, there = dr.dot(normals, away), dr.maximum(-dr.dot(ad.Array3f(nx, ny, nz), away), 0)
-        share = area * there / dr.maximum(dr.fma(dr.pi, square, area), 1e-20)
+        towards, share, light = _seen_emitter(emitters, k, count, means)
+        here = dr.dot(normals, towards)
         sides = share * dr.maximum(here, 0), share * dr.maximum(-here, 0)
         return k + 1, [dr.fma(side, light[c], sums[3 * i + c]) for i, side in enumerate(sides) for c in range(3)]
 
-    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
-        return k < emitters
+    return _sum_over(count, received, [dr.zeros(ad.Float, batch.capacity) for _ in range(6)])
 
-    start = ad.UInt32(0), [dr.zeros(ad.Float, batch.capacity) for _ in range(6)]
-    _, sums = dr.while_loop(start, has_more, received, mode="symbolic", label="bounce")
-    return list(sums)
+
+def mirrored(
+    scatterers: Scatterers, emitters: list[Float], count: int, direction: Array3f, batch: PaddedBatch
+) -> list[Float]:
+    """Light that each Gaussian mirrors towards the viewer, on the scale of `irradiance`: three Floats [M] per specular
+    reflectance at normal incidence, three per what it is at grazing incidence. direction: Array3f [3, M], unit, from
+    the camera;  emitters, count: as there
+
+    Sum over emitters k of their light times D n.l w / (4 (l.h)^2), the first with 1 - f, the others with f = (1 -
+    l.h)^5: facets of GGX (Walter et al. 2007) with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's
+    reflectance (1994); w = pi A cos_k / (pi r^2 + A) the angle that the emitter fills, h halfway between it and the
+    viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the emitter's own spread.
+    """
+    means = batch.repeat_last(scatterers.means)
+    normals = seen_side_normals(_normals(scatterers, batch), direction)
+    view = -dr.dot(normals, direction)
+
+    def received(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
+        towards, share, light = _seen_emitter(emitters, k, count, means)
+        here = dr.dot(normals, towards)
+        both = dr.maximum(1 - dr.dot(towards, direction), 1e-6)  # 1 + l.v = 2 (l.h)^2
+        alpha2 = 0.25 * share + ROUGHNESS**2
+        spread = dr.maximum(1 - 0.5 * dr.square(here + view) * dr.rcp(both) * (1 - alpha2), 1e-4)
+        weight: Float = 0.5 * share * alpha2 * dr.maximum(here, 0) * dr.rcp(dr.square(spread) * both)
+        beyond = 1 - dr.sqrt(0.5 * both)
+        grazing: Float = weight * dr.square(dr.square(beyond)) * beyond
+        parts: list[Float] = [weight - grazing, grazing]
+        return k + 1, [dr.fma(part, light[c], sums[3 * i + c]) for i, part in enumerate(parts) for c in range(3)]
+
+    return _sum_over(count, received, [dr.zeros(ad.Float, batch.capacity) for _ in range(6)])
+
+
+def grazing_reflectance(specular: Float) -> Float:
+    """What a surface of this specular reflectance at normal incidence reflects at grazing incidence: all of it from the
+    0.04 of glass on, less where facets hide each other or there are none."""
+    return dr.minimum(specular / GLASS, 1)
+
+
+def grazing_reflectance_slope(specular: Float) -> Float:
+    """d `grazing_reflectance`."""
+    return dr.select(specular < GLASS, ad.Float(1 / GLASS), 0)
+
+
+def scattering(
+    scatterers: Scatterers, count: int, radiance: Callable[[UInt32], list[Float]], batch: PaddedBatch
+) -> list[Float]:
+    """Emitters as `irradiance` and `mirrored` read them: `count` of the Gaussians, evenly chosen by number, each in
+    place of N / count. radiance: from which Gaussians they are [count] to the light that they scatter, RGB, as a share
+    of what a white surface that faces the Sun does
+
+    Area: 2 pi s_1 s_2 opacity, of its two longer axes, times N / count, times `OVERLAP`.
+    """
+    index = dr.arange(ad.UInt32, count)
+    k = chosen(index, count, batch.count)
+    place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
+    normal = lit_normals(scatterers, k, batch.count)
+    least = dr.minimum(log_scales[0], dr.minimum(log_scales[1], log_scales[2]))
+    opacity = opacities(dr.gather(ad.Float, scatterers.logit_opacities, k))
+    each = ad.Float(batch.count) / count
+    area = 2 * dr.pi * OVERLAP * each * opacity * dr.exp(dr.sum(log_scales) - least)
+    numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *radiance(k)]
+    sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
+    packed = [store(values, index, count) for values in packets([dr.select(sound, number, 0) for number in numbers])]
+    dr.eval(packed)
+    return packed
+
+
+def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, gaussians: UInt32) -> list[Float]:
+    """rho_k v_k |n_k . s| of Gaussians k, three Floats as wide. visibility: [M] in a list, or nothing for 1;
+    gaussians: N"""
+    seen = dr.dot(lit_normals(scatterers, k, gaussians), scatterers.sun)
+    if visibility:
+        seen *= dr.gather(ad.Float, visibility[0], k)
+    logits = [dr.gather(ad.Float, scatterers.features, (scatterers.albedos + i) * gaussians + k) for i in range(3)]
+    return [seen * sigmoid(logit) for logit in logits]
+
+
+def dimmed_emitters(emitters: list[Float], share: Float) -> list[Float]:
+    """Emitters of N Gaussians with the `share` of their light, Float [N]."""
+    count = dr.width(emitters[0]) // packet_sizes(EMITTER)[0]
+    return _dim(emitters, count, share, dr.opaque(ad.UInt32, dr.width(share)))
+
+
+@recorded
+def _dim(emitters: list[Float], count: int, share: Float, gaussians: UInt32) -> list[Float]:
+    index = dr.arange(ad.UInt32, count)
+    *surface, red, green, blue = load(emitters, index, count)[:EMITTER]
+    left = dr.gather(ad.Float, share, chosen(index, count, gaussians))
+    packed = [store(values, index, count) for values in packets([*surface, left * red, left * green, left * blue])]
+    dr.eval(packed)
+    return packed
 
 
 def add_irradiance(color: Float, light: Float, linear: bool) -> Float:
@@ -85,25 +169,39 @@ def add_irradiance_slopes(color: Float, light: Float, linear: bool) -> tuple[Flo
     return light_slope * decode_srgb_slope(color), light_slope
 
 
-def _emitters(scatterers: Scatterers, emitters: int, visibility: list[Float], batch: PaddedBatch) -> list[Float]:
-    """Ten Floats [emitters]: place, normal of the lit side, area, light that it scatters a piece of area."""
-    each = ad.Float(batch.count) / emitters
-    k = ad.UInt32((ad.Float(dr.arange(ad.UInt32, emitters)) + 0.5) * each)
-    k = dr.minimum(k, batch.count - 1)
+def _normals(scatterers: Scatterers, batch: PaddedBatch) -> Array3f:
+    """Array3f [3, M], unit."""
+    return unit_normals(ad.Array3f(batch.block(scatterers.features, scatterers.normals, 3)))
 
-    def rows(first: int) -> list[Float]:
-        return [dr.gather(ad.Float, scatterers.features, (first + i) * batch.count + k) for i in range(3)]
 
-    place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
-    normal = unit_normals(ad.Array3f(rows(scatterers.normals)))
-    cosine = dr.dot(normal, scatterers.sun)
-    least = dr.minimum(log_scales[0], dr.minimum(log_scales[1], log_scales[2]))
-    opacity = opacities(dr.gather(ad.Float, scatterers.logit_opacities, k))
-    area = 2 * dr.pi * OVERLAP * each * opacity * dr.exp(dr.sum(log_scales) - least)
-    seen = dr.abs(cosine)
-    if visibility:
-        seen *= dr.gather(ad.Float, visibility[0], k)
-    light = [seen * sigmoid(logit) for logit in rows(scatterers.albedos)]
-    numbers = [*place, *dr.select(cosine < 0, -normal, normal), dr.minimum(area, MAX_EMITTER_AREA), *light]
-    sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
-    return [dr.select(sound, number, 0) for number in numbers]
+def _seen_emitter(emitters: list[Float], k: UInt32, count: int, means: Array3f) -> tuple[Array3f, Float, list[Float]]:
+    """(unit direction towards emitter k [3, M], w / pi: share of the hemisphere's projected angle that it fills seen
+    from `means`, its light)."""
+    x, y, z, nx, ny, nz, area, *light = load(emitters, k, count)[:EMITTER]
+    away = ad.Array3f(x, y, z) - means
+    square: Any = dr.squared_norm(away)
+    away *= dr.rsqrt(dr.maximum(square, 1e-12))
+    there = dr.maximum(-dr.dot(ad.Array3f(nx, ny, nz), away), 0)
+    return away, area * there / dr.maximum(dr.fma(dr.pi, square, area), 1e-20), light
+
+
+def _sum_over(
+    count: int, received: Callable[[UInt32, list[Float]], tuple[UInt32, list[Float]]], sums: list[Float]
+) -> list[Float]:
+    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
+        return k < count
+
+    return list(dr.while_loop((ad.UInt32(0), sums), has_more, received, mode="symbolic", label="bounce")[1])
+
+
+def lit_normals(scatterers: Scatterers, k: UInt32, gaussians: UInt32) -> Array3f:
+    """Unit normals of Gaussians k on their sides that face the Sun. gaussians: N"""
+    rows = [dr.gather(ad.Float, scatterers.features, (scatterers.normals + i) * gaussians + k) for i in range(3)]
+    normal = unit_normals(ad.Array3f(rows))
+    return dr.select(dr.dot(normal, scatterers.sun) < 0, -normal, normal)
+
+
+def chosen(index: UInt32, count: int, gaussians: UInt32) -> UInt32:
+    """Which of N `gaussians` the emitters `index` of `count` are."""
+    k = ad.UInt32((ad.Float(index) + 0.5) * (ad.Float(gaussians) / count))
+    return dr.minimum(k, gaussians - 1)

@@ -21,6 +21,9 @@ class LightConfig:
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
     #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
     bounce: int = 0
+    #: of the bounce: Gaussians scatter what the field paints, not what their albedos say, and mirror what arrives, by a
+    #: specular reflectance that each learns, too
+    gloss: bool = False
     #: add what the Earth gives; none: where every training picture names an Earth whose albedo is not 0 and the
     #: field has normals, as `train` finds out
     earth: bool | None = None
@@ -74,10 +77,21 @@ class LightConfig:
 
     @property
     def features(self) -> int:
-        """F: numbers that each Gaussian has for the field, then for the refinement of shadows, then of its albedo."""
-        return self.albedos + 3 * (self.bounce > 0 or bool(self.earth))
+        """F: numbers that each Gaussian has for the field, then for the refinement of shadows, then of what it
+        reflects."""
+        return self.albedos + 3 * (self.bounce > 0 or bool(self.earth)) + 3 * self.mirrors
 
     @property
     def albedos(self) -> int:
         """Which of these numbers are the logits of the albedo (RGB) for bounce and Earth: this and the next two."""
         return self.field.stored + (self.refine.features if self.refine else 0)
+
+    @property
+    def specular(self) -> int | None:
+        """Which of them are the logits of the specular reflectance (RGB), likewise; None where there are none."""
+        return self.albedos + 3 if self.mirrors else None
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether surfaces mirror what bounces."""
+        return self.gloss and self.bounce > 0

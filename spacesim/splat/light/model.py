@@ -6,7 +6,7 @@ as given, and so do shadows, as in the literature, unless `ShadowConfig.gradient
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import drjit as dr
@@ -22,6 +22,7 @@ from spacesim.learning import mlp
 from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
+from spacesim.splat.light.bounce import dimmed_emitters
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading import ShadingInputs, ShadingTape, SunEncoding, split_weights
@@ -73,12 +74,16 @@ class Sunlight:
 
     visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
     bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
+    emitters: list[Float] = field(
+        default_factory=list
+    )  #: of `bounce.scattering` where surfaces mirror them, or nothing
 
     def dimmed(self, share: Float, linear: bool) -> "Sunlight":
         """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
         visibility = share if self.visibility is None else self.visibility * share
         of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
-        return Sunlight(visibility, [light * of_light for light in self.bounced])
+        emitters = dimmed_emitters(self.emitters, of_light) if self.emitters else []
+        return Sunlight(visibility, [light * of_light for light in self.bounced], emitters)
 
 
 @dataclass
@@ -200,7 +205,10 @@ class LightModel:
         last and nothing has changed."""
         if self.config.shadow is None and not self.config.bounce:
             return Sunlight(None, [])
-        read, direction = [*gaussians.rows(), *self.weights], None if sun is None else np.asarray(sun).tobytes()
+        read, direction = (
+            [*gaussians.rows(), *self.weights, *self.embeddings],
+            None if sun is None else np.asarray(sun).tobytes(),
+        )
         last = self._last_sunlight
         if dr.grad_enabled(read):
             return self._sunlight(gaussians, sun)
@@ -212,10 +220,10 @@ class LightModel:
     def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
         shadows = self.shadows(gaussians, sun)
         batch = PaddedBatch.of(gaussians.count, still=True)
-        _, of_refine = split_weights(self.config, self.weights)
-        inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows)
-        visibility, bounced = kernels.sunlight(self.config, of_refine, inputs, batch)
-        return Sunlight(visibility[0] if visibility else None, bounced)
+        terms = self._with_embedding(self.encode_sun(sun), self._mean_embedding())
+        inputs = self._inputs(gaussians, None, terms, shadows)
+        visibility, bounced, emitters = kernels.sunlight(self.config, self.weights, inputs, batch)
+        return Sunlight(visibility[0] if visibility else None, bounced, emitters)
 
     def shade_picture(
         self,
@@ -240,7 +248,15 @@ class LightModel:
         of_field, _ = split_weights(self.config, self.weights)
         visibility = [] if light.visibility is None else [light.visibility]
         shown = kernels.shade_picture(
-            self.config, of_field, inputs, batch, cache.first_layer, cache.packed, visibility, light.bounced
+            self.config,
+            of_field,
+            inputs,
+            batch,
+            cache.first_layer,
+            cache.packed,
+            visibility,
+            light.bounced,
+            light.emitters,
         )
         return shown[:3], shown[3] if visibility else None
 

@@ -8,12 +8,24 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf
+from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf, UInt32
 from spacesim.learning import mlp
 from spacesim.learning.mlp import round_up_rows
-from spacesim.learning.reflectance import past_earth
+from spacesim.learning.reflectance import past_earth, surface_cosines
 from spacesim.splat.light import cooperative
-from spacesim.splat.light.bounce import Scatterers, add_irradiance, add_irradiance_slopes, irradiance
+from spacesim.splat.light.bounce import (
+    Scatterers,
+    add_irradiance,
+    add_irradiance_slopes,
+    albedo_radiance,
+    chosen,
+    grazing_reflectance,
+    grazing_reflectance_slope,
+    irradiance,
+    lit_normals,
+    mirrored,
+    scattering,
+)
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
     FieldConfig,
@@ -26,7 +38,7 @@ from spacesim.splat.light.field import (
     sun_adjoint,
     sun_facing,
 )
-from spacesim.splat.light.padded_batch import PaddedBatch
+from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch
 from spacesim.splat.light.shadow.light_camera import towards_sun
 from spacesim.splat.light.shadow.refine import (
     ShadowRefinementConfig,
@@ -35,6 +47,10 @@ from spacesim.splat.light.shadow.refine import (
     refine_occlusion_slope,
 )
 from spacesim.splat.raster.cameras import Projection
+from spacesim.splat.raster.surface import across
+from spacesim.splat.raster.tone import decode_srgb
+
+SIDES = 4  #: from which what bounces is seen where it comes from
 
 
 @dataclass
@@ -99,10 +115,8 @@ def shade(
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
-    bounced = []
-    if config.bounce:
-        bounced = irradiance(_scatterers(config, inputs), config.bounce, [1 - value for value in occlusion], batch)
-    scattered = _scattered(config, field_inputs, inputs.sun.left(bounced), batch)
+    bounced, emitters = _bounce(config, field_weights, inputs, [1 - value for value in occlusion], batch)
+    scattered = _scattered(config, inputs, inputs.sun.left(bounced), emitters, batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
@@ -120,9 +134,10 @@ def shade_picture(
     packed: cooperative.PackedNetwork,
     visibility: list[Float],
     bounced: list[Float],
+    emitters: list[Float],
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`;  visibility: [N]
-    in a list, or nothing;  bounced: see `model.Sunlight`"""
+    in a list, or nothing;  bounced, emitters: see `model.Sunlight`"""
     field, field_inputs = config.field, _field_inputs(inputs)
     views = field_views(field, field_inputs, batch)
     if first_layer:
@@ -136,7 +151,7 @@ def shade_picture(
     faces = sun_facing(field, field_inputs, views, batch)
     shown = _dimmed(inputs.sun, colors, [batch.pad_zeros(value) for value in visibility], faces)
     arriving = inputs.sun.left([batch.pad_zeros(light) for light in bounced])
-    scattered = _scattered(config, field_inputs, arriving, batch)
+    scattered = _scattered(config, inputs, arriving, emitters, batch)
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
@@ -145,15 +160,16 @@ def shade_picture(
 
 @recorded
 def sunlight(
-    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[list[Float], list[Float]]:
-    """([refined visibility [N]] or [], light that bounces, see `model.Sunlight`)."""
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+) -> tuple[list[Float], list[Float], list[Float]]:
+    """([refined visibility [N]] or [], light that bounces and its emitters, see `model.Sunlight`)."""
+    field_weights, refine_weights = split_weights(config, weights)
     visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
     dr.eval(visibility)
-    bounced = irradiance(_scatterers(config, inputs), config.bounce, visibility, batch) if config.bounce else []
+    bounced, emitters = _bounce(config, field_weights, inputs, visibility, batch)
     dr.eval(bounced)
     shown = batch.unpad([*visibility, *bounced], inputs.means.x)
-    return shown[: len(visibility)], shown[len(visibility) :]
+    return shown[: len(visibility)], shown[len(visibility) :], emitters
 
 
 @recorded
@@ -252,7 +268,7 @@ def adjoint(
         if config.refine.bias_info:  # its inputs have 1 - occlusion, too, before the other three
             grad_occlusion -= batch.row(grad_items, config.refine.shape.inputs - 4)
     if grad_albedo:
-        parts.append((batch.matrix(grad_albedo), 0, 3))
+        parts.append((batch.matrix(grad_albedo), 0, len(grad_albedo)))
     grad_raw_occlusion = [grad_occlusion] if config.shadow and config.shadow.gradients else []
     dr.eval(grad_raw_occlusion)
     by_encoding = by_encoding if config.field.embeddings else []
@@ -300,29 +316,100 @@ def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
     )
 
 
-def _albedo(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
-    """Three Floats [M] in (0, 1)."""
-    return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 3)]
+def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
+    """Floats [M] in (0, 1): the albedo, then, where surfaces mirror, the specular reflectance, RGB each."""
+    return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 6 if config.mirrors else 3)]
 
 
-def _scattered(config: LightConfig, inputs: FieldInputs, bounced: list[Float], batch: PaddedBatch) -> list[Float]:
+def _bounce(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, visibility: list[Float], batch: PaddedBatch
+) -> tuple[list[Float], list[Float]]:
+    """(six Floats [M] of `irradiance`, or nothing; the emitters where surfaces mirror them, or nothing). weights: of
+    the field"""
+    if not config.bounce:
+        return [], []
+    scatterers = _scatterers(config, inputs)
+
+    def radiance(k: UInt32) -> list[Float]:
+        if config.mirrors:
+            return _painted(config, weights, inputs, visibility, batch.count)
+        return albedo_radiance(scatterers, visibility, k, batch.count)
+
+    emitters = scattering(scatterers, config.bounce, radiance, batch)
+    return irradiance(scatterers, emitters, config.bounce, batch), emitters if config.mirrors else []
+
+
+def _painted(
+    config: LightConfig,
+    weights: list[Float],
+    inputs: ShadingInputs,
+    visibility: list[Float],
+    gaussians: UInt32,
+) -> list[Float]:
+    """The light of all emitters, three Floats, as the field paints them: mean of what is seen of each from four sides
+    at 45 degrees to its normal. weights: of the field;  visibility: [M] in a list, or nothing for 1"""
+    field, count = config.field, config.bounce
+    columns = PaddedBatch(dr.opaque(ad.UInt32, SIDES * count), -(-SIDES * count // CHUNK) * CHUNK)
+    column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
+    emitter, side = column // SIDES, ad.Float(column % SIDES) * (2 * dr.pi / SIDES)
+    number = chosen(emitter, count, gaussians)
+    normals = lit_normals(_scatterers(config, inputs), number, gaussians)
+    along = across(normals)
+    sine, cosine = dr.sincos(side)
+    direction = -(0.5**0.5) * (normals + cosine * along + sine * dr.cross(normals, along))
+    rows = [dr.gather(ad.Float, inputs.features, i * gaussians + number) for i in range(field.features)]
+    rows += [*field.view(direction), *surface_cosines(normals, direction, towards_sun(inputs.sun.light_axes))]
+    output, _ = mlp.forward(field.shape, weights, columns.matrix(rows, field.shape.rows), inputs.sun.field_encoding)
+    colors = [mlp.sigmoid(columns.row(output, i)) for i in range(3)]
+    for share in visibility:
+        colors = [color * dr.gather(ad.Float, share, number) for color in colors]
+    light = colors if config.linear else [decode_srgb(color) for color in colors]
+    dr.eval(light)
+    index = SIDES * dr.arange(ad.UInt32, count)
+    sums = [sum((dr.gather(ad.Float, values, index + i) for i in range(SIDES)), ad.Float(0)) for values in light]
+    return [total / SIDES for total in sums]
+
+
+def _scattered(
+    config: LightConfig, inputs: ShadingInputs, bounced: list[Float], emitters: list[Float], batch: PaddedBatch
+) -> list[Float]:
     """Three Floats [M]: light of the bounce and the Earth that arrives at the side that is seen, or nothing where there
-    is neither. bounced: six Floats [M] of `irradiance`, or nothing"""
+    is neither; where surfaces mirror, the six of `mirrored`. bounced: six Floats [M] of `irradiance`, or nothing;
+    emitters: as `_bounce` has them"""
     light: list[Float] = []
+    field_inputs = _field_inputs(inputs)
     if bounced:
-        over = is_back_side_seen(config.field, inputs, batch)
+        over = is_back_side_seen(config.field, field_inputs, batch)
         light = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
-    for earth in earthlight(config.field, inputs, batch):
+    for earth in earthlight(config.field, field_inputs, batch):
         light = [channel + earth for channel in light or [ad.Float(0)] * 3]
+    if emitters:
+        direction = field_inputs.camera.directions_to(batch.repeat_last(inputs.means))
+        light += inputs.sun.left(mirrored(_scatterers(config, inputs), emitters, config.bounce, direction, batch))
     return light
+
+
+def _reflected(reflectances: list[Float], scattered: list[Float]) -> list[Float]:
+    """Three Floats [M]: what surfaces reflect of `_scattered`."""
+    shares = reflectances + [grazing_reflectance(specular) for specular in reflectances[3:]]
+    parts = [rho * light for rho, light in zip(shares, scattered, strict=True)]
+    return [sum(parts[c + 3 :: 3], parts[c]) for c in range(3)]
+
+
+def _reflected_slopes(reflectances: list[Float], scattered: list[Float]) -> list[Float]:
+    """d `_reflected` by each reflectance."""
+    mirrored = zip(reflectances[3:], scattered[3:6], scattered[6:], strict=True)
+    slopes = [along + grazing_reflectance_slope(specular) * grazing for specular, along, grazing in mirrored]
+    return scattered[:3] + slopes
 
 
 def _add_scattered(
     config: LightConfig, inputs: ShadingInputs, shown: list[Float], scattered: list[Float], batch: PaddedBatch
 ) -> list[Float]:
     """Dimmed colours [M] with the light of `_scattered`, what else is in `shown` as it was."""
-    rows = zip(shown[:3], _albedo(config, inputs, batch), scattered, strict=True)
-    return [add_irradiance(color, rho * light, config.linear) for color, rho, light in rows] + shown[3:]
+    reflected = _reflected(_reflectances(config, inputs, batch), scattered)
+    rows = zip(shown[:3], reflected, strict=True)
+    return [add_irradiance(color, light, config.linear) for color, light in rows] + shown[3:]
 
 
 def _scattered_adjoint(
@@ -333,16 +420,19 @@ def _scattered_adjoint(
     scattered: list[Float],
     batch: PaddedBatch,
 ) -> tuple[list[Float], list[Float], list[Float]]:
-    """Gradients [M] of the dimmed colours, of the albedos' logits and, in a list, of the Earth's light, where there is
-    any. What bounces counts as given, as it is small."""
-    grad_dimmed, grad_albedo, grad_light = [], [], ad.Float(0)
-    rows = zip(gradients, dimmed, _albedo(config, inputs, batch), scattered, strict=True)
-    for gradient, color, rho, light in rows:
-        of_color, of_light = add_irradiance_slopes(color, rho * light, config.linear)
+    """Gradients [M] of the dimmed colours, of the logits of reflectances and, in a list, of the Earth's light, where
+    there is any. What bounces counts as given, as it is small."""
+    reflectances = _reflectances(config, inputs, batch)
+    grad_dimmed, by_light, grad_light = [], [], ad.Float(0)
+    for gradient, color, light in zip(gradients, dimmed, _reflected(reflectances, scattered), strict=True):
+        of_color, of_light = add_irradiance_slopes(color, light, config.linear)
         grad_dimmed.append(gradient * of_color)
-        grad_albedo.append(gradient * of_light * light * rho * (1 - rho))
-        grad_light += gradient * of_light * rho
-    return grad_dimmed, grad_albedo, [grad_light for _ in inputs.sun.beams]
+        by_light.append(gradient * of_light)
+    for gradient, rho in zip(by_light, reflectances, strict=False):  # the albedo alone
+        grad_light += gradient * rho
+    rows = zip(by_light * 2, reflectances, _reflected_slopes(reflectances, scattered), strict=False)
+    grad_logits = [gradient * slope * rho * (1 - rho) for gradient, rho, slope in rows]
+    return grad_dimmed, grad_logits, [grad_light for _ in inputs.sun.beams]
 
 
 def split_weights(config: LightConfig, weights: list[Float]) -> tuple[list[Float], list[Float]]:

@@ -53,6 +53,12 @@ def unit(vector: Array3f) -> Array3f:
     return dr.select(has_direction, vector * dr.rsqrt(dr.select(has_direction, square, 1)), 0)
 
 
+def across(direction: Array3f) -> Array3f:
+    """Array3f [3, P], unit: one that is perpendicular to the unit `direction`."""
+    away = dr.select(dr.abs(direction[0]) < 0.7, ad.Array3f(1, 0, 0), ad.Array3f(0, 1, 0))
+    return dr.normalize(dr.cross(direction, away))
+
+
 def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> UInt32:
     """UInt32 [height * width]: the splat behind which less than half of the light passes; `NONE` where there is none.
 

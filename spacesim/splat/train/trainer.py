@@ -24,14 +24,14 @@ from spacesim.learning.cameras import farthest_camera, focus_point, nearest_came
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
-from spacesim.splat.light.bounce import ALBEDO
+from spacesim.splat.light.bounce import ALBEDO, SPECULAR
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.train.checkpoint import FORMAT, GaussianCheckpointHeader
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.discs import EVERY, turn_discs
+from spacesim.splat.train.discs import EVERY, LAST, turn_discs
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
@@ -127,8 +127,8 @@ class Trainer(TrainingLoop):
 
     def _turn_discs(self) -> None:
         """Now and then, where light has learned their normals, which without shadows stand in for these, too."""
-        light = self.config.light
-        if light and light.shadow and light.field.surface and self.config.surfels and self.iteration % EVERY == 0:
+        light, is_due = self.config.light, self.iteration <= LAST and self.iteration % EVERY == 0
+        if light and light.shadow and light.field.surface and self.config.surfels and is_due:
             turn_discs(self.gaussians, light.field.features)
 
     def _refine(self) -> None:
@@ -332,6 +332,8 @@ class Trainer(TrainingLoop):
             features, light = self.gaussians.to_numpy()["features"], self.config.light
             features[:, field.features : field.stored] = surface_normals(means)
             features[:, light.albedos :] = ALBEDO
+            if light.specular is not None:
+                features[:, light.specular :] = SPECULAR
             self.gaussians.features = upload(features.T.ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), robust_radius(means))
         return LightModel.initial(self.config.light, frame, self.config.seed, len(self.views))

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import look_at
+from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 from spacesim.splat.light.bounce import OVERLAP
 from spacesim.splat.light.config import LightConfig
@@ -159,6 +161,81 @@ def replace_features(splats: Gaussians, count: int) -> Gaussians:
     return Gaussians.from_numpy({**arrays, "features": arrays["features"][:, :5]})
 
 
+def shining(splats: Gaussians, specular: float, **more) -> tuple[Gaussians, LightModel]:
+    """With this specular reflectance, and a field that paints everything a linear 0.6."""
+    arrays = splats.to_numpy()
+    logit = np.full((splats.count, 3), np.log(specular / (1 - specular)))
+    arrays["features"] = np.column_stack([arrays["features"], logit])
+    light = model(LightConfig(FIELD, bounce=splats.count, gloss=True, linear=True, **more))
+    light.weights = [ad.Float(0) * weight for weight in light.weights]
+    light.weights[-1] = ad.Float([np.log(0.6 / 0.4)] * 3)
+    return Gaussians.from_numpy(arrays), light
+
+
+def mirrored(normal: np.ndarray, view: np.ndarray, specular: float, is_wall) -> float:
+    """Integral of GGX of alpha 0.15 over the directions in which there is a wall, of 1; Kelemen's visibility, Schlick's
+    reflectance with all of it from 0.04 on at grazing incidence."""
+    towards = fibonacci_sphere(400_000)
+    towards = towards[is_wall(towards) & (towards @ normal > 0)]
+    half = towards + view
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    facing, across = half @ normal, half @ view
+    facets = 0.15**2 / (np.pi * (facing**2 * (0.15**2 - 1) + 1) ** 2)
+    reflectance = specular + (min(specular / 0.04, 1) - specular) * (1 - across) ** 5
+    return float((reflectance * facets * (towards @ normal) / (4 * across**2)).sum() * 4 * np.pi / 400_000)
+
+
+@pytest.mark.parametrize("specular", [0.01, 0.5])
+@pytest.mark.parametrize("tilt", [0.0, 0.5, np.pi])
+def test_a_mirror_shows_what_it_faces(specular, tilt):
+    """Over a wall, across its lobe, or turned to black space."""
+    up, normal = np.array([0.0, 0, 1]), np.array([np.sin(tilt), 0, -np.cos(tilt)])
+    splats, light = shining(wall_and_receiver([0, 0, 0.2], normal), specular)
+    camera = Pinhole.of(Camera(look_at(np.array([1e-3, 0, 0.2]) + 3 * normal, [0, 0, 0.2]), 8, 8, 8, 8, 4, 4))
+    found = mirror_in(splats, light, camera, up)
+    below = mirrored(normal, normal, specular, lambda d: (d[:, 2] < 0) & (np.abs(d[:, :2]).max(axis=1) < -5 * d[:, 2]))
+    assert found == pytest.approx(0.6 * below, rel=0.08, abs=1e-4)
+    assert (below > 0.5 * specular) == (tilt < 1)
+
+
+def mirror_in(splats: Gaussians, light: LightModel, camera: Pinhole, sun: np.ndarray) -> float:
+    """What the last Gaussian mirrors, of a red of 0.6 that all paint."""
+    shown = numbers(light.shade_picture(splats, camera, sun)[0][0])[-1]
+    return shown - 0.6 - 0.5 * numbers(light.sunlight(splats, sun).bounced[0])[-1]
+
+
+def test_a_glossy_surface_mirrors_most_at_grazing_angles():
+    """Glass seen at 75 degrees that stands before a wall: several times its 0.04 at normal incidence."""
+    turn, wall = Rotation.from_euler("y", 90, degrees=True), wall_and_receiver([0, 0, 0], [0, 0, 1]).to_numpy()
+    wall["means"][:-1] = turn.apply(wall["means"][:-1]) - np.array([0.7, 0, 0])
+    quaternions = turn * Rotation.from_quat(wall["quaternions"][:-1], scalar_first=True)
+    wall["quaternions"][:-1] = quaternions.as_quat(scalar_first=True)
+    wall["features"][:-1, 2:5] = [1, 0, 0]
+    splats, light = shining(Gaussians.from_numpy(wall), 0.04)
+    view = np.array([np.sin(np.radians(75)), 0, np.cos(np.radians(75))])
+    camera = Pinhole.of(Camera(look_at(3 * view, [0, 0, 0]), 8, 8, 8, 8, 4, 4))
+    found = mirror_in(splats, light, camera, np.array([1.0, 0, 0]))
+
+    def is_wall(towards: np.ndarray) -> np.ndarray:
+        return (towards[:, 0] < 0) & (np.abs(towards[:, 1:]).max(axis=1) < -towards[:, 0] / 0.7)
+
+    expected = mirrored(np.array([0.0, 0, 1]), view, 0.04, is_wall)
+    assert expected > 3 * 0.04
+    assert found == pytest.approx(0.6 * expected, rel=0.05)
+
+
+def test_what_is_dimmed_scatters_less_of_it():
+    splats, light = shining(wall_and_receiver([0, 0, 0.3], [0, 0, -1]), 0.5)
+    up, share = np.array([0.0, 0, 1]), np.full(splats.count, 0.5)
+    camera = Pinhole.of(Camera(look_at([0.01, 0, -3], [0, 0, 0.3]), 8, 8, 8, 8, 4, 4))
+    whole = light.sunlight(splats, up)
+    half = whole.dimmed(upload(share), linear=True)
+    found = [numbers(light.shade_picture(splats, camera, up, light_of)[0][0])[-1] for light_of in (whole, half)]
+    dark = light.shade_picture(splats, camera, up, whole.dimmed(upload(0 * share), linear=True))[0][0]
+    assert found[1] == pytest.approx(0.5 * found[0], rel=1e-4), "visibility dims the field, too"
+    assert numbers(dark)[-1] == 0
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -202,11 +279,12 @@ def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_p
     assert config.light.bounce > 0
     runs = [train(small_lit_dataset, tmp_path / name, config) for name in ("one", "two")]
     assert len({(run.path / "model.safetensors").read_bytes() for run in runs}) == 1
-    albedos = runs[0].gaussians.to_numpy()["features"][:, config.light.albedos :]
-    assert albedos.shape[1] == 3
+    learned = runs[0].gaussians.to_numpy()["features"][:, config.light.albedos :]
+    assert learned.shape[1] == 6
     start = Trainer(small_lit_dataset, config).gaussians.to_numpy()["features"][:, config.light.albedos :]
-    assert np.ptp(start) == 0
-    assert np.ptp(albedos) > 0.05
+    for rows in (slice(3), slice(3, 6)):  # albedos, specular reflectances
+        assert np.ptp(start[:, rows]) == 0
+        assert np.ptp(learned[:, rows]) > 0.05
     frame, arrays = small_lit_dataset.test[0], runs[0].gaussians.to_numpy()
     arrays["features"][:, config.light.albedos :] = -30  # black
     black = replace(runs[0], gaussians=Gaussians.from_numpy(arrays)).predict(frame.camera, frame.sun)
@@ -234,7 +312,7 @@ def test_presets_bounce_where_shadows_are_known(name):
         assert preset(name, method).light.bounce == 0
     for method in ("shadow-map", "shadow-splat"):
         light = preset(name, method).light
-        assert (light.bounce > 0) == (name != "thesis")
+        assert (light.bounce > 0) == light.gloss == (name != "thesis")
         assert light.refine.sun.size == (25 if name == "thesis" else 1)
         assert light.refine.positions == ("light" if name == "thesis" else "world")
 

@@ -64,6 +64,11 @@ CONFIGS = {
     ),
     "bounce": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7),
     "bounce, linear": LightConfig(ON_SURFACE, bounce=5, linear=True),
+    "gloss": LightConfig(
+        ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7, gloss=True, earth=True
+    ),
+    "gloss, embeddings": LightConfig(replace(ON_SURFACE, embeddings=2), bounce=5, gloss=True),
+    "gloss, linear": LightConfig(ON_SURFACE, bounce=5, gloss=True, linear=True),
     "earth": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7, earth=True),
     "earth, linear": LightConfig(ON_SURFACE, earth=True, linear=True),
     "no sun": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]))),
@@ -167,27 +172,45 @@ def shortest_axes(arrays: dict) -> np.ndarray:
     return turns[np.arange(len(turns)), :, arrays["log_scales"].argmin(axis=1)]
 
 
-def bounced(light: LightModel, arrays: dict, visibility: np.ndarray) -> np.ndarray:
-    """[N, 3] light of the emitters at the side that is seen: discs of Wallace et al. (1989), one pair after another."""
+def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> np.ndarray:
+    """[N, 3] light of the emitters at the side that is seen: discs of Wallace et al. (1989), one pair after another;
+    with gloss [N, 9], then what each mirrors per specular reflectance at normal and at grazing incidence. paint: the
+    field's colours of some Gaussians seen along directions [M, 3]"""
     config, count = light.config, len(arrays["means"])
     features, first = arrays["features"].astype(np.float64), config.field.features
     normals = features[:, first : first + 3] / np.linalg.norm(features[:, first : first + 3], axis=1, keepdims=True)
-    albedo, found = sigmoid(features[:, config.albedos :]), np.zeros((count, 3))
-    for i in range(count):
-        towards = np.array([0, -6, 1.0]) - arrays["means"][i]
-        seen = normals[i] * np.sign(normals[i] @ towards)
-        for number in range(config.bounce):
-            k = int((number + 0.5) * count / config.bounce)
-            away = arrays["means"][k] - arrays["means"][i]
-            square = away @ away
-            if square == 0:
-                continue
-            lit = normals[k] * np.sign(normals[k] @ SUN)
-            long = np.sort(np.exp(arrays["log_scales"][k]))[1:].prod()
-            area = 0.3 * count / config.bounce * 2 * np.pi * long * sigmoid(arrays["logit_opacities"][k])
-            cosines = max(seen @ away, 0) * max(-lit @ away, 0) / square
-            found[i] += albedo[k] * visibility[k] * (lit @ SUN) * area * cosines / (np.pi * square + area)
-    return found
+    albedo, found = sigmoid(features[:, config.albedos : config.albedos + 3]), np.zeros((3, count, 3))
+    for number in range(config.bounce):
+        k = int((number + 0.5) * count / config.bounce)
+        lit = normals[k] * np.sign(normals[k] @ SUN)
+        long = np.sort(np.exp(arrays["log_scales"][k]))[1:].prod()
+        area = 0.3 * count / config.bounce * 2 * np.pi * long * sigmoid(arrays["logit_opacities"][k])
+        emitted = albedo[k] * visibility[k] * (lit @ SUN)
+        if config.gloss:
+            colors = visibility[k] * paint(np.full(4, k), four_sides(lit))
+            emitted = (colors if config.linear else light_of(colors)).mean(axis=0)
+        for i in np.delete(np.arange(count), k):
+            away, view = arrays["means"][k] - arrays["means"][i], np.array([0, -6, 1.0]) - arrays["means"][i]
+            square, seen = away @ away, normals[i] * np.sign(normals[i] @ view)
+            away, view = away / np.sqrt(square), view / np.linalg.norm(view)
+            share = max(-lit @ away, 0) * area / (np.pi * square + area)
+            found[0, i] += emitted * share * max(seen @ away, 0)
+            half = (away + view) / np.linalg.norm(away + view)
+            alpha2 = 0.15**2 + share / 4  # pi share: the solid angle
+            facets = alpha2 / (np.pi * ((seen @ half) ** 2 * (alpha2 - 1) + 1) ** 2)
+            mirrored = facets * max(seen @ away, 0) / (4 * (away @ half) ** 2) * np.pi * share
+            grazing = (1 - away @ half) ** 5
+            found[1, i] += emitted * mirrored * (1 - grazing)
+            found[2, i] += emitted * mirrored * grazing
+    return np.concatenate(found, axis=1) if config.gloss else found[0]
+
+
+def four_sides(normal: np.ndarray) -> np.ndarray:
+    """[4, 3] from viewers at 45 degrees to a unit `normal`."""
+    along = np.cross(normal, [1, 0, 0] if abs(normal[0]) < 0.7 else [0, 1, 0])
+    along /= np.linalg.norm(along)
+    around = [along, np.cross(normal, along), -along, -np.cross(normal, along)]
+    return -(normal + np.array(around)) / np.sqrt(2)
 
 
 def brightened(light: LightModel, color: np.ndarray, more: np.ndarray) -> np.ndarray:
@@ -213,20 +236,24 @@ def twin(
     direction = arrays["means"] - np.array([0, -6, 1.0])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     features, split = arrays["features"].astype(np.float64), 1 + 2 * field.layers
-    items = np.concatenate([features[:, : field.features], encoded(field.view, direction)], axis=1)
-    if field.surface:
-        normal = features[:, field.features : field.stored]
-        items = np.concatenate([items, cosines(normal, direction)], axis=1)
+    own = embedding_of(light) if embedding is None else embedding
+    shared = np.concatenate([encoded(field.sun, SUN[None])[0], own])
+    normal = features[:, field.features : field.stored]
+
+    def paint(some: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        items = np.concatenate([features[some, : field.features], encoded(field.view, direction)], axis=1)
+        if field.surface:
+            items = np.concatenate([items, cosines(normal[some], direction)], axis=1)
+        return sigmoid(network(field.shape, weights[:split], items, shared))
+
     faces = 1
     if field.surface:
         learned, of_shape = (cosines(n, direction)[:, 0] for n in (normal, shortest_axes(arrays)))
         faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
-    own = embedding_of(light) if embedding is None else embedding
-    shared = np.concatenate([encoded(field.sun, SUN[None])[0], own])
-    color = sigmoid(network(field.shape, weights[:split], items, shared))
+    color = paint(np.arange(len(direction)), direction)
     if not raw:
         visible = np.ones(len(color))
-        color, given = with_scattered(light, arrays, eclipsed(light, color, left), visible, given, earth)
+        color, given = with_scattered(light, arrays, eclipsed(light, color, left), visible, given, earth, paint)
         return color, visible, given
     occlusion, alignment, thickness, bias = raw
     if config.refine:
@@ -246,7 +273,7 @@ def twin(
         sure = np.clip(occlusion, 0.02, 0.98)
         occlusion = sigmoid(output + (np.log(sure / (1 - sure)) if refine.residual else 0))
     color = eclipsed(light, color * (1 - occlusion)[:, None], left)
-    color, given = with_scattered(light, arrays, color, 1 - occlusion, given, earth)
+    color, given = with_scattered(light, arrays, color, 1 - occlusion, given, earth, paint)
     return color, left * (1 - occlusion) * faces, given
 
 
@@ -265,20 +292,33 @@ def earthlit(light: LightModel, arrays: dict, earth: Earth = EARTH) -> np.ndarra
     return sum(power * np.maximum(normals @ beam, 0) for *beam, power in earth.beams(SUN))[:, None]
 
 
-def with_scattered(light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given, earth) -> tuple:
+def with_scattered(
+    light: LightModel, arrays: dict, color: np.ndarray, visible: np.ndarray, given, earth, paint
+) -> tuple:
     """(colours, light that bounces): as they are for a model without bounce and Earth."""
     config = light.config
     if not (config.bounce or config.earth):
         return color, None
-    given = bounced(light, arrays, visible) if given is None else given
-    albedo = sigmoid(arrays["features"].astype(np.float64)[:, config.albedos :])
-    more = earth.visible_sun(SUN) * given + (earthlit(light, arrays, earth) if config.earth else 0)
-    return brightened(light, color, albedo * more), given
+    given = bounced(light, arrays, visible, paint) if given is None else given
+    logits = arrays["features"].astype(np.float64)[:, config.albedos :]
+    more = earth.visible_sun(SUN) * given[:, :3] + (earthlit(light, arrays, earth) if config.earth else 0)
+    reflected = sigmoid(logits[:, :3]) * more
+    if config.gloss:
+        specular = sigmoid(logits[:, 3:])
+        mirrored = specular * given[:, 3:6] + np.minimum(specular / 0.04, 1) * given[:, 6:]
+        reflected = reflected + earth.visible_sun(SUN) * mirrored
+    return brightened(light, color, reflected), given
 
 
 @pytest.mark.parametrize(
     ("name", "earth"),
-    [*((name, EARTH) for name in CONFIGS), ("earth", ECLIPSE), ("bounce, linear", ECLIPSE), ("no sun", ECLIPSE)],
+    [
+        *((name, EARTH) for name in CONFIGS),
+        ("earth", ECLIPSE),
+        ("gloss", ECLIPSE),
+        ("bounce, linear", ECLIPSE),
+        ("no sun", ECLIPSE),
+    ],
 )
 def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
     light, count = model(name), 37

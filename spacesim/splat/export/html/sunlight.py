@@ -90,9 +90,10 @@ def _side(gaussians: Gaussians, light: LightModel, earth: Earth | None) -> int:
 
 
 def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
-    """[N, 6]: of both sides, RGB each."""
-    logits = _features(gaussians, light.config.albedos).T
-    return np.tile(1 / (1 + np.exp(-logits)), (1, 2))
+    """[N, 6]: of both sides, RGB each. What surfaces mirror counts as scattered: a table knows no camera."""
+    firsts = [light.config.albedos] if light.config.specular is None else [light.config.albedos, light.config.specular]
+    shares = [1 / (1 + np.exp(-_features(gaussians, first).T)) for first in firsts]
+    return np.tile(np.minimum(sum(shares), 1), (1, 2))
 
 
 def _earthlight(gaussians: Gaussians, light: LightModel, sun: np.ndarray, earth: Earth) -> np.ndarray:
