@@ -128,15 +128,15 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
+    yield "splat, surface, no gloss", with_settings(splatted, {"light.gloss": False})
     with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
     yield "splat, surface, refinement given the Sun", with_shadow(splatted, refine=with_sun)
     yield "splat, surface, no bounce, refinement given the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)
-    if splatted.supersample == 1:
-        yield "none, surface, 2x2 samples", replace(relit, supersample=2)
-        yield "splat, surface, 2x2 samples", replace(splatted, supersample=2)
-    else:
-        yield "none, surface, pixels of one", replace(relit, supersample=1)
-        yield "splat, surface, pixels of one", replace(splatted, supersample=1)
+    for name, config in (("none", relit), ("splat", splatted)):
+        label, supersample = ("pixels of one", 1) if config.supersample > 1 else ("2x2 samples", 2)
+        yield f"{name}, surface, {label}", replace(config, supersample=supersample)
+    label, views = ("one view", 1) if splatted.views_per_step > 1 else ("two views", 2)
+    yield f"splat, surface, {label} a step", replace(splatted, views_per_step=views)
     yield "none, surface, finer", finer(relit)
     yield "splat, surface, finer", finer(splatted)
     yield "splat, surface, finer, supervised, gradients", finer(both)
@@ -176,7 +176,7 @@ def as_ours(config: TrainConfig) -> TrainConfig:
     if config.light is None or config.light.shadow is None:
         return config
     ours, refine = shadow_of(fast), replace(refine_of(fast), width=refine_of(config).width)
-    config = with_bounce(config, light_of(fast).bounce)
+    config = with_settings(with_bounce(config, light_of(fast).bounce), {"light.gloss": light_of(fast).gloss})
     return with_shadow(config, bias=ours.bias, grazing=ours.grazing, method=ours.method, refine=refine)
 
 

@@ -247,10 +247,13 @@ def test_the_warm_start_reads_its_masks_in_the_pixels_of_the_view(small_dataset,
 
 def test_fine_light_is_drawn_finely():
     for method in ("relight", "shadow-map", "shadow-splat", "park"):
-        config = preset("fine", method)
-        assert (config.supersample, config.refinement.prune_opacity) == (2, 0.005)
-        assert config.refinement.split_screen_size < preset("fast", method).refinement.split_screen_size
-        assert preset("fast", method).supersample == preset("thesis", method).supersample == 1
+        config, fast = preset("fine", method), preset("fast", method)
+        assert (config.supersample, config.refinement.split_screen_size) == (2, 0.015)
+        assert (fast.supersample == 2) == (fast.refinement.split_screen_size == 0.015) == (method[:6] == "shadow")
+        assert (config.views_per_step, config.refinement.max_gaussians) == (
+            (2, 100_000) if method[:6] == "shadow" else (1, 250_000)
+        )
+        assert preset("demo", method).supersample == preset("thesis", method).supersample == 1
     assert preset("fine").supersample == 1
     assert preset("fine", "shadow-map").light.shadow.method.filter == "variance"
 

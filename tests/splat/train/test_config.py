@@ -30,10 +30,10 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "9930604c1963994e",
-    "fast": "79e9a688ee35d032",
-    "fine": "d78f23a42ff3e3e8",
-    "thesis": "e39f448901662cb3",
+    "demo": "d9ce0980a50fb7fe",
+    "fast": "e27ebab4ca0dbfab",
+    "fine": "aca0f0cac64b5f84",
+    "thesis": "806759ef5cd0df0e",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
 HASHED = (
@@ -50,6 +50,12 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
         return config
     features = 16 if config.preset == "demo" else 32
     settings = {"light.field.features": features, "rates.features_final": config.rates.features, "surfels": False}
+    if config.method in ("shadow-map", "shadow-splat"):
+        fine = {"supersample": 2, "light.bounce": 1024, "iterations": 20_000, "refinement.prune_opacity": 0.005}
+        settings |= {"views_per_step": 1, "light.gloss": False, "refinement.max_gaussians": 250_000}
+        settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
+        if config.preset == "fast":
+            settings["refinement.split_screen_size"] = 0.03
     return with_settings(config, settings)
 
 
