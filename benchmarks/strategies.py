@@ -36,6 +36,7 @@ from spacesim.splat.train.config import warm_start as warm_start_of
 SCENE = {"views": 40, "test_suns": 0, "test_views": 5, "spp": 64, "test_spp": 1024}
 KINDS = ("thesis", "field", "ours", "start")
 BOX = 10.0  #: sizes of the object
+MOST = 250_000  #: Gaussians
 
 PICTURES = {"MAE": "mae", "PSNR": "psnr", "SSIM": "ssim", "LPIPS": "lpips"}
 DIGITS = {"PSNR": 2, "Chamfer": 6, "normals [deg]": 1}
@@ -86,6 +87,7 @@ def configurations(kind: str, options: argparse.Namespace) -> Iterator[tuple[str
 
     def made(strategy: str = "default", **changes: Any) -> TrainConfig:
         config = preset(options.preset, options.method, strategy)
+        config = with_settings(config, {"refinement.max_gaussians": MOST})  # under presets of light all end at theirs
         return with_options(config, iterations=options.iterations, **changes)
 
     if kind == "thesis":

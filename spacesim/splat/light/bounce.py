@@ -10,13 +10,13 @@ from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.learning.mlp import sigmoid
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.gaussians import opacities
-from spacesim.splat.raster.records import load, packet_sizes, packets, store
+from spacesim.splat.raster.records import load, packets, store
 from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
@@ -45,7 +45,7 @@ class Scatterers:
 
 def irradiance(scatterers: Scatterers, emitters: list[Float], count: int, batch: PaddedBatch) -> list[Float]:
     """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
-    1 where all around is as bright as a white surface under the Sun, as far as areas add up to surfaces (`OVERLAP`).
+    1 where the light of all around is 1, as far as areas add up to surfaces (`OVERLAP`).
 
     emitters: of `scattering`, `count` of them
 
@@ -109,8 +109,7 @@ def scattering(
     scatterers: Scatterers, count: int, radiance: Callable[[UInt32], list[Float]], batch: PaddedBatch
 ) -> list[Float]:
     """Emitters as `irradiance` and `mirrored` read them: `count` of the Gaussians, evenly chosen by number, each in
-    place of N / count. radiance: from which Gaussians they are [count] to the light that they scatter, RGB, as a share
-    of what a white surface that faces the Sun does
+    place of N / count. radiance: of which Gaussians [count] to the light that they scatter, RGB
 
     Area: 2 pi s_1 s_2 opacity, of its two longer axes, times N / count, times `OVERLAP`.
     """
@@ -137,22 +136,6 @@ def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, 
         seen *= dr.gather(ad.Float, visibility[0], k)
     logits = [dr.gather(ad.Float, scatterers.features, (scatterers.albedos + i) * gaussians + k) for i in range(3)]
     return [seen * sigmoid(logit) for logit in logits]
-
-
-def dimmed_emitters(emitters: list[Float], share: Float) -> list[Float]:
-    """Emitters of N Gaussians with the `share` of their light, Float [N]."""
-    count = dr.width(emitters[0]) // packet_sizes(EMITTER)[0]
-    return _dim(emitters, count, share, dr.opaque(ad.UInt32, dr.width(share)))
-
-
-@recorded
-def _dim(emitters: list[Float], count: int, share: Float, gaussians: UInt32) -> list[Float]:
-    index = dr.arange(ad.UInt32, count)
-    *surface, red, green, blue = load(emitters, index, count)[:EMITTER]
-    left = dr.gather(ad.Float, share, chosen(index, count, gaussians))
-    packed = [store(values, index, count) for values in packets([*surface, left * red, left * green, left * blue])]
-    dr.eval(packed)
-    return packed
 
 
 def add_irradiance(color: Float, light: Float, linear: bool) -> Float:

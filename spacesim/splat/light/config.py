@@ -22,7 +22,7 @@ class LightConfig:
     #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
     bounce: int = 0
     #: of the bounce: Gaussians scatter what the field paints, not what their albedos say, and mirror what arrives, by a
-    #: specular reflectance that each learns, too
+    #: specular reflectance that each learns, too; without a bounce it says nothing
     gloss: bool = False
     #: add what the Earth gives; none: where every training picture names an Earth whose albedo is not 0 and the
     #: field has normals, as `train` finds out
@@ -90,6 +90,12 @@ class LightConfig:
     def specular(self) -> int | None:
         """Which of them are the logits of the specular reflectance (RGB), likewise; None where there are none."""
         return self.albedos + 3 if self.mirrors else None
+
+    @property
+    def sunlit_white(self) -> float:
+        """The colour, linear, of a white surface that faces the Sun, as light that bounces has it: 1 where albedos say
+        what is scattered, whatever the curve."""
+        return 2.0**self.curve.exposure / self.curve.white if self.curve and self.mirrors else 1.0
 
     @property
     def mirrors(self) -> bool:

@@ -22,7 +22,6 @@ from spacesim.learning import mlp
 from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
-from spacesim.splat.light.bounce import dimmed_emitters
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading import ShadingInputs, ShadingTape, SunEncoding, split_weights
@@ -74,16 +73,16 @@ class Sunlight:
 
     visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
     bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
-    emitters: list[Float] = field(
-        default_factory=list
-    )  #: of `bounce.scattering` where surfaces mirror them, or nothing
+    #: of `bounce.scattering`, where surfaces mirror them, or nothing
+    emitters: list[Float] = field(default_factory=list)
+    mirrored: list[Float] = field(default_factory=list)  #: what is left of that, a share [N] in a list, or nothing
 
     def dimmed(self, share: Float, linear: bool) -> "Sunlight":
         """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
         visibility = share if self.visibility is None else self.visibility * share
         of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
-        emitters = dimmed_emitters(self.emitters, of_light) if self.emitters else []
-        return Sunlight(visibility, [light * of_light for light in self.bounced], emitters)
+        mirrored = [left * of_light for left in self.mirrored] or [of_light]
+        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitters, mirrored)
 
 
 @dataclass
@@ -115,7 +114,7 @@ class _LastSunlight:
     """The Sun that was asked for last: cameras move more often than it does."""
 
     read: list[Float]  #: the arrays that it was made of
-    sun: bytes | None  #: its direction
+    asked: tuple[bytes | None, ...]  #: its direction, the embedding
     sunlight: Sunlight
 
 
@@ -148,7 +147,7 @@ class LightModel:
         self._training_frame = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
         self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
         self._cache = _PictureCache([], None, [], [])
-        self._last_sunlight = _LastSunlight([], None, Sunlight(None, []))
+        self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
@@ -200,27 +199,26 @@ class LightModel:
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
 
-    def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
+    def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for
-        last and nothing has changed."""
+        last and nothing has changed. embedding: as `shade_picture` takes it"""
         if self.config.shadow is None and not self.config.bounce:
             return Sunlight(None, [])
-        read, direction = (
-            [*gaussians.rows(), *self.weights, *self.embeddings],
-            None if sun is None else np.asarray(sun).tobytes(),
-        )
+        read = [*gaussians.rows(), *self.weights, *self.embeddings]
+        asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
         last = self._last_sunlight
         if dr.grad_enabled(read):
-            return self._sunlight(gaussians, sun)
-        if direction != last.sun or not _are_same(read, last.read):
-            sunlight = self._sunlight(gaussians, sun)
-            last = self._last_sunlight = _LastSunlight(_kept(read), direction, sunlight)
+            return self._sunlight(gaussians, sun, embedding)
+        if asked != last.asked or not _are_same(read, last.read):
+            sunlight = self._sunlight(gaussians, sun, embedding)
+            last = self._last_sunlight = _LastSunlight(_kept(read), asked, sunlight)
         return last.sunlight
 
-    def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None) -> Sunlight:
+    def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None) -> Sunlight:
         shadows = self.shadows(gaussians, sun)
         batch = PaddedBatch.of(gaussians.count, still=True)
-        terms = self._with_embedding(self.encode_sun(sun), self._mean_embedding())
+        of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
+        terms = self._with_embedding(self.encode_sun(sun), of_picture)
         inputs = self._inputs(gaussians, None, terms, shadows)
         visibility, bounced, emitters = kernels.sunlight(self.config, self.weights, inputs, batch)
         return Sunlight(visibility[0] if visibility else None, bounced, emitters)
@@ -238,7 +236,7 @@ class LightModel:
         Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
         the field's first layer makes of the features does not change with Sun or camera and stays for the next
         picture: as many numbers for each Gaussian as the layer has units."""
-        light = self.sunlight(gaussians, sun) if sunlight is None else sunlight
+        light = self.sunlight(gaussians, sun, embedding) if sunlight is None else sunlight
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
         cache = self._picture_cache(_features(gaussians), batch)
@@ -257,6 +255,7 @@ class LightModel:
             visibility,
             light.bounced,
             light.emitters,
+            light.mirrored,
         )
         return shown[:3], shown[3] if visibility else None
 

@@ -97,7 +97,7 @@ class ShadingTape:
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
-    scattered: list[Float]  #: 3 arrays [M], light of the bounce and the Earth at the side that is seen, or nothing
+    scattered: list[Float]  #: of `_scattered`, [M] each, or nothing
 
 
 @recorded
@@ -135,9 +135,11 @@ def shade_picture(
     visibility: list[Float],
     bounced: list[Float],
     emitters: list[Float],
+    mirrored: list[Float],
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`;  visibility: [N]
-    in a list, or nothing;  bounced, emitters: see `model.Sunlight`"""
+    in a list, or nothing;  bounced, emitters, mirrored: see
+    `model.Sunlight`"""
     field, field_inputs = config.field, _field_inputs(inputs)
     views = field_views(field, field_inputs, batch)
     if first_layer:
@@ -152,6 +154,8 @@ def shade_picture(
     shown = _dimmed(inputs.sun, colors, [batch.pad_zeros(value) for value in visibility], faces)
     arriving = inputs.sun.left([batch.pad_zeros(light) for light in bounced])
     scattered = _scattered(config, inputs, arriving, emitters, batch)
+    for share in mirrored:
+        scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
@@ -347,15 +351,17 @@ def _painted(
     gaussians: UInt32,
 ) -> list[Float]:
     """The light of all emitters, three Floats, as the field paints them: mean of what is seen of each from four sides
-    at 45 degrees to its normal. weights: of the field;  visibility: [M] in a list, or nothing for 1"""
+    at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the Sun.
+
+    weights: of the field;  visibility: [M] in a list, or nothing for 1
+    """
     field, count = config.field, config.bounce
-    columns = PaddedBatch(dr.opaque(ad.UInt32, SIDES * count), -(-SIDES * count // CHUNK) * CHUNK)
+    columns = PaddedBatch(gaussians, -(-SIDES * count // CHUNK) * CHUNK)
     column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
-    emitter, side = column // SIDES, ad.Float(column % SIDES) * (2 * dr.pi / SIDES)
-    number = chosen(emitter, count, gaussians)
+    number, side = chosen(column // SIDES, count, gaussians), column % SIDES
     normals = lit_normals(_scatterers(config, inputs), number, gaussians)
-    along = across(normals)
-    sine, cosine = dr.sincos(side)
+    along = across(normals, towards_sun(inputs.sun.light_axes))
+    sine, cosine = dr.sincos((ad.Float(side) + 0.5) * (2 * dr.pi / SIDES))
     direction = -(0.5**0.5) * (normals + cosine * along + sine * dr.cross(normals, along))
     rows = [dr.gather(ad.Float, inputs.features, i * gaussians + number) for i in range(field.features)]
     rows += [*field.view(direction), *surface_cosines(normals, direction, towards_sun(inputs.sun.light_axes))]
@@ -382,7 +388,7 @@ def _scattered(
         over = is_back_side_seen(config.field, field_inputs, batch)
         light = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
     for earth in earthlight(config.field, field_inputs, batch):
-        light = [channel + earth for channel in light or [ad.Float(0)] * 3]
+        light = [channel + config.sunlit_white * earth for channel in light or [ad.Float(0)] * 3]
     if emitters:
         direction = field_inputs.camera.directions_to(batch.repeat_last(inputs.means))
         light += inputs.sun.left(mirrored(_scatterers(config, inputs), emitters, config.bounce, direction, batch))
@@ -392,7 +398,7 @@ def _scattered(
 def _reflected(reflectances: list[Float], scattered: list[Float]) -> list[Float]:
     """Three Floats [M]: what surfaces reflect of `_scattered`."""
     shares = reflectances + [grazing_reflectance(specular) for specular in reflectances[3:]]
-    parts = [rho * light for rho, light in zip(shares, scattered, strict=True)]
+    parts = [rho * light for rho, light in zip(shares, scattered, strict=False)]  # without emitters the albedo alone
     return [sum(parts[c + 3 :: 3], parts[c]) for c in range(3)]
 
 
@@ -432,7 +438,7 @@ def _scattered_adjoint(
         grad_light += gradient * rho
     rows = zip(by_light * 2, reflectances, _reflected_slopes(reflectances, scattered), strict=False)
     grad_logits = [gradient * slope * rho * (1 - rho) for gradient, rho, slope in rows]
-    return grad_dimmed, grad_logits, [grad_light for _ in inputs.sun.beams]
+    return grad_dimmed, grad_logits, [config.sunlit_white * grad_light for _ in inputs.sun.beams]
 
 
 def split_weights(config: LightConfig, weights: list[Float]) -> tuple[list[Float], list[Float]]:

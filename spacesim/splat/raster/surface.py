@@ -53,10 +53,13 @@ def unit(vector: Array3f) -> Array3f:
     return dr.select(has_direction, vector * dr.rsqrt(dr.select(has_direction, square, 1)), 0)
 
 
-def across(direction: Array3f) -> Array3f:
-    """Array3f [3, P], unit: one that is perpendicular to the unit `direction`."""
-    away = dr.select(dr.abs(direction[0]) < 0.7, ad.Array3f(1, 0, 0), ad.Array3f(0, 1, 0))
-    return dr.normalize(dr.cross(direction, away))
+def across(direction: Array3f, towards: Array3f) -> Array3f:
+    """Array3f [3, P], unit: perpendicular to the unit `direction`, in the plane of it and `towards`; in any where these
+    are parallel."""
+    aside = towards - dr.dot(towards, direction) * direction
+    any_axis = dr.select(dr.abs(direction[0]) < 0.7, ad.Array3f(1, 0, 0), ad.Array3f(0, 1, 0))
+    aside = dr.select(dr.squared_norm(aside) > 1e-8, aside, dr.cross(direction, any_axis))
+    return dr.normalize(aside)
 
 
 def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> UInt32:

@@ -227,7 +227,7 @@ def _read(document: Document, rules: Rules) -> TrainConfig:
 
 def preset(name: str, method: str = "vanilla", strategy: str = "default") -> TrainConfig:
     """What a file of assets/presets says of a method and a strategy: `thesis`, the thesis's own schedule and networks;
-    `fast`, `fine` and `demo`, which are for pictures of some hundred pixels: `fast` takes minutes on two CPU cores.
+    `fast`, `fine` and `demo`, which are for pictures of some hundred pixels; two CPU cores take `demo`.
 
     name: "demo", "fast", "fine", "thesis"
     method: "vanilla", "relight", "shadow-map", "shadow-splat", "baseline-park"

@@ -36,7 +36,7 @@ CONFIGS = {
     "bounce": LightConfig(
         replace(FIELD, features=7, inputs=SurfaceConfig(**ENCODINGS)), replace(MAP, size=96), bounce=20, earth=True
     ),
-    "gloss": LightConfig(replace(FIELD, inputs=SurfaceConfig(**ENCODINGS)), MAP, bounce=20, gloss=True),
+    "gloss": LightConfig(replace(FIELD, inputs=SurfaceConfig(**ENCODINGS)), MAP, bounce=20, gloss=True, earth=True),
     "park": LightConfig(
         FIELD,
         ShadowConfig(

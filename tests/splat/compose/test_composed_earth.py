@@ -85,6 +85,17 @@ def test_it_reaches_into_shadows_of_others(run, shadows):
     np.testing.assert_allclose(shown.visibility, behind.predict(EYE, SUN).visibility, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["bounce", "gloss"])
+def test_a_black_one_that_hides_nothing_changes_nothing(name):
+    """In the shadow of another model, whose edge lies on this one."""
+    half = Pose(rotation_about(np.cross([0, 0, 1], SUN.direction), 55), 3 * SUN.direction + [0.7, 0, 0])
+    scene = GaussianComposition([PlacedRun(made_run(name, 3)), PlacedRun(disc_run(0.7), half)])
+    black = replace(SUN, earth=Earth([0.3, -0.2, -1.0], 60.0, 0.0))
+    found, expected = light_of(scene, black), light_of(scene, SUN)
+    assert expected.max() > 0.1
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
 def test_where_it_moves_pictures_change(run):
     scene = GaussianComposition([PlacedRun(run), PlacedRun(disc_run(0.3), Pose(translation=[0, 0, 2]))])
     first = scene.predict(EYE, BOTH).rgb

@@ -68,7 +68,9 @@ CONFIGS = {
         ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7, gloss=True, earth=True
     ),
     "gloss, embeddings": LightConfig(replace(ON_SURFACE, embeddings=2), bounce=5, gloss=True),
-    "gloss, linear": LightConfig(ON_SURFACE, bounce=5, gloss=True, linear=True),
+    "gloss, linear": LightConfig(
+        ON_SURFACE, bounce=5, gloss=True, earth=True, linear=True, tone="filmic", exposure=1.0
+    ),
     "earth": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7, earth=True),
     "earth, linear": LightConfig(ON_SURFACE, earth=True, linear=True),
     "no sun": LightConfig(replace(FIELD, inputs=ViewAloneConfig(ENCODINGS["view"]))),
@@ -206,11 +208,12 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> n
 
 
 def four_sides(normal: np.ndarray) -> np.ndarray:
-    """[4, 3] from viewers at 45 degrees to a unit `normal`."""
-    along = np.cross(normal, [1, 0, 0] if abs(normal[0]) < 0.7 else [0, 1, 0])
+    """[4, 3] from viewers at 45 degrees to a unit `normal`, off its plane with the Sun by 45 degrees about it."""
+    along = SUN - (SUN @ normal) * normal
     along /= np.linalg.norm(along)
-    around = [along, np.cross(normal, along), -along, -np.cross(normal, along)]
-    return -(normal + np.array(around)) / np.sqrt(2)
+    across = np.cross(normal, along)
+    around = [along + across, across - along, -along - across, along - across]
+    return -(normal + np.array(around) / np.sqrt(2)) / np.sqrt(2)
 
 
 def brightened(light: LightModel, color: np.ndarray, more: np.ndarray) -> np.ndarray:
@@ -301,7 +304,8 @@ def with_scattered(
         return color, None
     given = bounced(light, arrays, visible, paint) if given is None else given
     logits = arrays["features"].astype(np.float64)[:, config.albedos :]
-    more = earth.visible_sun(SUN) * given[:, :3] + (earthlit(light, arrays, earth) if config.earth else 0)
+    unit = 2**config.curve.exposure / config.curve.white if config.gloss and config.linear else 1
+    more = earth.visible_sun(SUN) * given[:, :3] + (unit * earthlit(light, arrays, earth) if config.earth else 0)
     reflected = sigmoid(logits[:, :3]) * more
     if config.gloss:
         specular = sigmoid(logits[:, 3:])

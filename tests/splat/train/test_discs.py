@@ -61,8 +61,9 @@ def test_training_draws_shape_and_light_together(small_lit_dataset, monkeypatch,
     light without shadows, for which its normals stand in."""
     config = replace(preset("demo", method), iterations=60, init_count=300, surfels=surfels)
     ends = []
-    for every in (10, 1000):
+    for every, last in ((10, 60), (10, 9)):
         monkeypatch.setattr(trainer, "EVERY", every)
+        monkeypatch.setattr(trainer, "LAST", last)
         trained = Trainer(small_lit_dataset, config)
         trained.run(lambda progress: None, lambda: None)
         arrays = trained.gaussians.to_numpy()

@@ -59,17 +59,19 @@ def tabulate_sunlight(
     blocks = max(side // BOUNCE_SIDE, 1)
     bounced = np.zeros((BOUNCE_SIDE, BOUNCE_SIDE, count, 6), np.float32)
     more = bool(light.config.bounce) or earth is not None
-    albedo = _albedo(gaussians, light) if more else np.zeros((count, 6), np.float32)
+    albedo, all_reflected = _reflectances(gaussians, light) if more else [np.zeros((count, 6), np.float32)] * 2
     for index, sun in enumerate(directions):
         sunlight = light.sunlight(gaussians, sun)
         if sunlight.visibility is not None:
             levels[index] = np.rint(LEVELS * np.clip(np.array(sunlight.visibility), 0, 1))
         if more:
-            arriving = np.zeros((count, 6), np.float32) if earth is None else _earthlight(gaussians, light, sun, earth)
+            reflected = np.zeros((count, 6), np.float32)
+            if earth is not None:
+                reflected += light.config.sunlit_white * albedo * _earthlight(gaussians, light, sun, earth)
             if sunlight.bounced:
                 left = 1.0 if earth is None else earth.visible_sun(sun)
-                arriving += left * np.stack([np.array(row) for row in sunlight.bounced], axis=1)
-            bounced[index // side // blocks, index % side // blocks] += albedo * arriving / blocks**2
+                reflected += left * all_reflected * np.stack([np.array(row) for row in sunlight.bounced], axis=1)
+            bounced[index // side // blocks, index % side // blocks] += reflected / blocks**2
         report()
     packed = np.ascontiguousarray((levels[0::2] | levels[1::2] << 4).T) if light.config.shadow else None
     if not more:
@@ -89,11 +91,13 @@ def _side(gaussians: Gaussians, light: LightModel, earth: Earth | None) -> int:
     return SIDE if gaussians.count <= MANY else SIDE_OF_MANY
 
 
-def _albedo(gaussians: Gaussians, light: LightModel) -> np.ndarray:
-    """[N, 6]: of both sides, RGB each. What surfaces mirror counts as scattered: a table knows no camera."""
-    firsts = [light.config.albedos] if light.config.specular is None else [light.config.albedos, light.config.specular]
-    shares = [1 / (1 + np.exp(-_features(gaussians, first).T)) for first in firsts]
-    return np.tile(np.minimum(sum(shares), 1), (1, 2))
+def _reflectances(gaussians: Gaussians, light: LightModel) -> list[np.ndarray]:
+    """Two of [N, 6]: of both sides the albedo, RGB each; the same with what surfaces mirror, which counts as scattered,
+    as a table knows no camera."""
+    albedo = 1 / (1 + np.exp(-_features(gaussians, light.config.albedos).T))
+    specular = light.config.specular
+    both = albedo if specular is None else np.minimum(albedo + 1 / (1 + np.exp(-_features(gaussians, specular).T)), 1)
+    return [np.tile(albedo, (1, 2)), np.tile(both, (1, 2))]
 
 
 def _earthlight(gaussians: Gaussians, light: LightModel, sun: np.ndarray, earth: Earth) -> np.ndarray:
