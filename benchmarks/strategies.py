@@ -32,11 +32,11 @@ from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.eval.report.write import write_report
 from spacesim.splat.train.config import METHODS, TrainConfig, preset, with_options, with_settings
 from spacesim.splat.train.config import warm_start as warm_start_of
+from spacesim.splat.train.strategies.control import DensificationConfig
 
 SCENE = {"views": 40, "test_suns": 0, "test_views": 5, "spp": 64, "test_spp": 1024}
 KINDS = ("thesis", "field", "ours", "start")
 BOX = 10.0  #: sizes of the object
-MOST = 250_000  #: Gaussians
 
 PICTURES = {"MAE": "mae", "PSNR": "psnr", "SSIM": "ssim", "LPIPS": "lpips"}
 DIGITS = {"PSNR": 2, "Chamfer": 6, "normals [deg]": 1}
@@ -87,7 +87,8 @@ def configurations(kind: str, options: argparse.Namespace) -> Iterator[tuple[str
 
     def made(strategy: str = "default", **changes: Any) -> TrainConfig:
         config = preset(options.preset, options.method, strategy)
-        config = with_settings(config, {"refinement.max_gaussians": MOST})  # under presets of light all end at theirs
+        unbound = {"refinement.max_gaussians": DensificationConfig().max_gaussians}  # at the preset's all would end
+        config = with_settings(config, unbound)
         return with_options(config, iterations=options.iterations, **changes)
 
     if kind == "thesis":
