@@ -129,6 +129,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
     yield "splat, surface, no gloss", with_settings(splatted, {"light.gloss": False})
+    every = {"split_screen": "all", "split_screen_size": mapped.refinement.split_screen_size}
+    yield "splat, surface, sizes not held", with_settings(splatted, {"refinement": every, "light.shadow.bias": 5.0})
     with_sun = ShadowRefinementConfig(width=refine_of(splatted).width)
     yield "splat, surface, refinement given the Sun", with_shadow(splatted, refine=with_sun)
     yield "splat, surface, no bounce, refinement given the Sun", with_bounce(with_shadow(splatted, refine=with_sun), 0)

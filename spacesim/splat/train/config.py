@@ -161,6 +161,11 @@ class TrainConfig:
         stop = self.refinement.refine_stop
         return stop if stop < self.iterations else 3 * self.iterations // 4
 
+    @property
+    def holds_sizes(self) -> bool:
+        """Whether no Gaussian gets larger than those that `refinement` splits."""
+        return self.refinement.split_screen == "held" and not hasattr(self.strategy, "reads")
+
     def downscale(self, step: int) -> int:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""
         return 1 << max(self.num_downscales - step // self.resolution_schedule, 0)

@@ -21,6 +21,8 @@ from spacesim.splat.train.loss.photometric import photometric_loss
 from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, visibility_loss
 from spacesim.splat.train.warm_start import foreground_loss
 
+RADIUS = 3  #: of a splat on the screen, standard deviations
+
 
 def project_views(
     rows: list[Float],
@@ -41,14 +43,14 @@ def project_views(
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:
-    """Float [N], whole pixels: three standard deviations along the longer axis on the screen (rho of thesis 5.4), 0 for
+    """Float [N], whole pixels: `RADIUS` along the longer axis on the screen (rho of thesis 5.4), 0 for
     what is out of the picture. A Gaussian counts as seen where this is above 0, however faint it is: the `radii` of
     gsplat 1.4. What the rasterizer skips is another matter (`Footprints.visible`)."""
     product = splats.a * splats.c
     determinant = dr.rcp(dr.maximum(product - dr.square(splats.b), 1e-7 * product))  # needles cancel
     xx, yy, xy = splats.c * determinant, splats.a * determinant, -splats.b * determinant
     longest = 0.5 * (xx + yy) + dr.sqrt(dr.square(0.5 * (xx - yy)) + dr.square(xy))
-    radius = dr.ceil(3 * dr.sqrt(longest))
+    radius = dr.ceil(RADIUS * dr.sqrt(longest))
     seen = camera.in_reach(camera.transform(gaussians.means)) & (radius < MAX_MAGNITUDE)
     seen &= (splats.x + radius > 0) & (splats.x - radius < camera.width)
     seen &= (splats.y + radius > 0) & (splats.y - radius < camera.height)

@@ -5,6 +5,7 @@ A step takes one view or several forward and backward (`view_pass`), moves all p
 """
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.learning.adam import NetworkAdam
-from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
+from spacesim.learning.cameras import farthest_camera, focus_point, middle_picture_width, nearest_camera
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
@@ -37,7 +38,7 @@ from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import TargetImage, update_light
+from spacesim.splat.train.stages import RADIUS, TargetImage, update_light
 from spacesim.splat.train.start import initial_gaussians, lay_flat, scene_scale, surface_normals
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
@@ -62,7 +63,7 @@ class Trainer(TrainingLoop):
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
         self.pictures = LearnedPictures(dataset, config, first_suns, poses)
-        self.scene_scale = scene_scale(dataset)
+        self.scene_scale, self._picture_width = scene_scale(dataset), middle_picture_width(dataset)
         features = config.light.features if config.light else 0
         count = min(config.init_count, config.refinement.max_gaussians)
         self.gaussians = initial_gaussians(
@@ -210,7 +211,14 @@ class Trainer(TrainingLoop):
     def _step_gaussians(self, degree: int, results: list[ViewResult]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
         views = [result.take_gradients() for result in results]
-        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties())
+        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties(), self._largest_scale())
+
+    def _largest_scale(self) -> list[Float]:
+        """ln of metres, once Gaussians grow in number, of a configuration that holds their sizes; else nothing."""
+        refinement, index = self.config.refinement, self.iteration
+        if not self.config.holds_sizes or index < refinement.refine_start or self._warming(index):
+            return []
+        return [dr.opaque(ad.Float, math.log(refinement.split_screen_size * self._picture_width / RADIUS))]
 
     def _penalties(self) -> dict[str, Float]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""

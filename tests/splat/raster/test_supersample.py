@@ -248,8 +248,10 @@ def test_the_warm_start_reads_its_masks_in_the_pixels_of_the_view(small_dataset,
 def test_fine_light_is_drawn_finely():
     for method in ("relight", "shadow-map", "shadow-splat", "park"):
         config, fast = preset("fine", method), preset("fast", method)
-        assert (config.supersample, config.refinement.split_screen_size) == (2, 0.015)
-        assert (fast.supersample == 2) == (fast.refinement.split_screen_size == 0.015) == (method[:6] == "shadow")
+        size = 0.008 if method == "shadow-splat" else 0.015
+        assert (config.supersample, config.refinement.split_screen_size) == (2, size)
+        assert (fast.supersample == 2) == (fast.refinement.split_screen_size == size) == (method[:6] == "shadow")
+        assert config.holds_sizes == fast.holds_sizes == (method == "shadow-splat")
         assert (config.views_per_step, config.refinement.max_gaussians) == (
             (2, 100_000) if method[:6] == "shadow" else (1, 250_000)
         )

@@ -30,9 +30,9 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "d9ce0980a50fb7fe",
-    "fast": "e27ebab4ca0dbfab",
-    "fine": "aca0f0cac64b5f84",
+    "demo": "e9f758ee217a327e",
+    "fast": "2531ecdf5546031e",
+    "fine": "e5cb9f5c02dd43ef",
     "thesis": "806759ef5cd0df0e",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
@@ -56,6 +56,9 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
         settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03
+    if config.method == "shadow-splat":  # of these the one of `fine`
+        settings |= {"refinement.split_screen": "all", "refinement.split_screen_size": 0.015}
+        settings |= {"light.shadow.bias": 5.0, "light.shadow.size": 1024}
     return with_settings(config, settings)
 
 

@@ -5,7 +5,7 @@ step holds all of them once, and only those of a part twice (docs/research/memor
 slower on a CPU.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -59,11 +59,14 @@ class Update:
         views: list[ViewGradients],
         factors: Float,
         penalties: Mapping[str, Float],
+        largest: Sequence[Float] = (),
     ) -> None:
         """Replace the parameters and their moments, part by part.
 
         views: emptied on the way, so that gradients go once they are read
-        factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name.
+        factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name
+        largest: ln of metres, no scale gets larger, a Float of width 1 in a list, or nothing
+
         Harmonics of no degree up to `degree` have never had a gradient: they stay as they are.
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
@@ -81,6 +84,7 @@ class Update:
             degree,
             factors,
             penalties,
+            list(largest),
             self.antialiased,
             self.scale,
             self.surfels,
@@ -124,6 +128,7 @@ def _move_own(
     degree: int,
     factors: Float,
     penalties: Mapping[str, Float],
+    largest: list[Float],
     antialiased: bool,
     scale: float,
     surfels: bool,
@@ -158,6 +163,8 @@ def _move_own(
     grad_rows = [dr.grad(row) for row in shape_rows]
     grad_rows += [mean([SH_C0 * grad_sum[c] for grad_sum in grad_sums]) for c in range(count - OWN)]
     moved, moments = _step([*dr.detach(shape_rows), *rows[OWN:count]], grad_rows, packed, factors, 0)
+    for bound in largest:
+        moved[ROWS["log_scales"]] = [dr.minimum(row, bound) for row in moved[ROWS["log_scales"]]]
     if surfels:
         moved[ROWS["log_scales"]] = flattened(moved[ROWS["log_scales"]])
     dr.eval(grad_sums, moved, moments)

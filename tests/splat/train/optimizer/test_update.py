@@ -106,6 +106,23 @@ def test_a_step_does_not_depend_on_what_was_recorded(name):
     np.testing.assert_array_equal(*found)
 
 
+@pytest.mark.parametrize("surfels", [False, True])
+def test_no_scale_gets_larger_than_it_may(surfels):
+    """Those that are smaller move as they do without a bound."""
+    view, scales, bound = Pinhole.of(camera(0.8)), [], float(np.log(0.05))
+    for largest in ([], [dr.opaque(ad.Float, bound)]):
+        gaussians = Gaussians.from_numpy(random_splats(300))
+        weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
+        optimizer, factors = Adam(gaussians.rows()), ad.Float([1.0, 1.0, *[0.1] * 59])
+        gradients = [view_gradients(gaussians, view, weights, 3)]
+        Update(False, 1.0, surfels)(gaussians, optimizer, 3, gradients, factors, {}, largest)
+        scales.append(np.array(gaussians.log_scales))
+    free, held = scales
+    assert (free[1:] > bound).any()
+    assert (free[1:] < bound).any()
+    np.testing.assert_array_equal(held[1:], np.minimum(free[1:], np.float32(bound)))
+
+
 def test_a_step_holds_few_rows_twice():
     """Beyond the rows and their moments, less than half as much again, where all at once would be as much again."""
     count, view = 2**15, Pinhole.of(camera(0.8))

@@ -157,6 +157,21 @@ def test_splitting_by_size_can_ask_for_a_gradient():
         assert refine_once(1100, config, gradient=gradient, radius=radius)[3] == (0, split, 1)
 
 
+def test_where_sizes_are_held_the_widest_are_split_first():
+    """Of three that are wide and two whose gradients are high, within a budget of two more."""
+    radius, gradient = [0.0, 0.02, 0.03, 0.04, 0.0, 0.0], [0.5, 0.3, 0.0, 0.0, 0.0, 0.0]
+    moved = {}
+    for which in ("all", "held"):
+        config = DensificationConfig(split_screen=which, split_screen_size=0.01, max_gaussians=8)
+        _, model, means, _ = refine_once(1100, config, gradient=gradient, radius=radius)
+        kept = np.array(model.means).T
+        moved[which] = [i for i, mean in enumerate(means) if not (np.abs(kept - mean).max(axis=1) < 1e-7).any()]
+    assert {2, 3} <= set(moved["held"])
+    assert 1 not in moved["held"]
+    assert 1 in moved["all"]
+    assert 2 not in moved["all"]
+
+
 def test_what_is_small_and_wide_on_the_screen_is_duplicated_and_split():
     """As in gsplat: three where there was one, of which two are halves."""
     radius = [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]
