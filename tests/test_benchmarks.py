@@ -407,6 +407,31 @@ def test_suns_compares_the_same_number_of_pictures(command, place):
 
 
 @smallest(
+    "scenes.py --out OUT --craft cubesat,lander --suns 2 --views 2 --resolution 32 --samples 4 --preset demo"
+    " --iterations 6 --seeds 2 --backend llvm --json"
+)
+def test_scenes_compare_methods_on_each_craft(command, place):
+    rows = {row["craft"]: row for row in json.loads(call(command))["rows"]}
+    assert list(rows) == ["cubesat", "lander"]
+    for craft, row in rows.items():
+        data = read_dataset(place / f"OUT/{craft}/data")
+        assert (len(data.train), len(data.test)) == (4, 44)
+        assert row["PSNR"] - row["no shadows"] == pytest.approx(row["gain"], abs=2e-4)
+        known, unseen = (
+            np.mean([report(place, craft, seed)[part]["image"]["psnr"]["mean"] for seed in range(2)])
+            for part in ("known_suns", "unseen_suns")
+        )
+        assert (unseen, known - unseen) == pytest.approx((row["PSNR"], row["gap"]), abs=2e-4)
+        assert row["gain, deviation"] >= 0
+    assert len(read_dataset(place / "OUT/lander/data").scene["parts"]) > 20
+
+
+def report(place: Path, craft: str, seed: int) -> dict:
+    """metrics.json of a training with shadows."""
+    return json.loads((place / f"OUT/{craft}/shadow-splat-{seed}/eval/metrics.json").read_text())
+
+
+@smallest(
     "light.py --backend llvm --sizes 300x32 --step-sizes 300x32 --preset demo --repeats 2 --methods relight,shadow-map"
     " --markdown --json found.json"
 )

@@ -1,0 +1,105 @@
+"""What shadows are worth on one spacecraft and another: the same presets, untouched, under Suns never seen.
+
+    python benchmarks/scenes.py --out OUT [--craft boxsat,telescope,upper-stage,cubesat,station,lander] [--preset fast]
+                                [--suns 16] [--views 40] [--resolution 256] [--samples 1024] [--seeds 1] [--json]
+
+Each craft stands alone among cameras all around, station and lander as mesh files that the benchmark writes. Methods
+are `relight`, which casts no shadows, and the one of --method. PSNR over the silhouette, BER by brightness, "gap": by
+how much Suns of training are better. With several seeds, of training: means over them, and the deviation of the gain.
+What is done already is not done again.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from support import common, craft
+
+from spacesim import backend
+from spacesim.data.store import read_dataset
+from spacesim.eval.evaluate import EvaluateConfig
+from spacesim.splat.train.config import METHODS, preset, with_options
+
+SCENE = {"spp": 64, "test_suns": 8, "test_views": 5, "known_test_views": 2, "shared_test_views": True}
+CRAFT = "boxsat", "telescope", "upper-stage", "cubesat", *craft.NAMES
+
+
+def main() -> None:
+    parser = common.arguments(__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
+    parser.add_argument("--craft", default=",".join(CRAFT), help="commas between (all)")
+    parser.add_argument("--suns", type=common.positive, default=16, help="of training (16)")
+    parser.add_argument("--views", type=common.positive, default=40, help="under each of them (40)")
+    parser.add_argument("--resolution", type=common.positive, default=256, metavar="PX", help="of the pictures (256)")
+    parser.add_argument("--samples", type=common.positive, default=1024, metavar="N", help="of test pictures (1024)")
+    parser.add_argument("--method", choices=METHODS[2:], default="shadow-splat")
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
+    parser.add_argument("--seeds", type=common.positive, default=1, help="trainings a row (1)")
+    options = parser.parse_args()
+    names = common.row_names(options.craft)
+    unknown = [name for name in names if name not in CRAFT]
+    if unknown:
+        parser.error(f"--craft: expected some of {', '.join(CRAFT)}, found {unknown[0]!r}")
+    backend.select(options.backend)
+    rows = list(rows_of(names, options))
+    common.emit({"rows": rows}, {f"{options.method}, {options.preset}": rows}, options)
+
+
+def rows_of(names: list[str], options: Any) -> Iterator[common.Row]:
+    """A row for each craft."""
+    scene = {"suns": options.suns, "views": options.views, **SCENE, "test_spp": options.samples}
+    for name in names:
+        folder = options.out / name
+        path = craft.write(name, folder / "mesh") if name in craft.NAMES else alone(name, folder)
+        data = read_dataset(common.generated(str(path), folder / "data", **scene, resolution=options.resolution))
+        without, method = (
+            [trained(method, seed, data, folder, options) for seed in range(options.seeds)]
+            for method in ("relight", options.method)
+        )
+        yield {"craft": name, **summary(without, method)}
+
+
+def alone(name: str, folder: Path) -> Path:
+    """The scene file of a built-in spacecraft with nothing beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.toml"
+    path.write_text(f'[[objects]]\nspacecraft = "{name}"\n')
+    return path
+
+
+def trained(method: str, seed: int, data: Any, folder: Path, options: Any) -> common.Row:
+    config = replace(with_options(preset(options.preset, method), iterations=options.iterations), seed=seed)
+    return common.measured(
+        f"{folder.name}, {method}", config, EvaluateConfig(geometry=None), data, folder / f"{method}-{seed}"
+    )
+
+
+def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:
+    """Means over trainings without shadows and with them; {"note": why} where one has failed."""
+    notes = [result["note"] for result in without + method if "note" in result]
+    if notes:
+        return {"note": notes[0]}
+    base, ours = (mean(results, "unseen_suns", "image", "psnr") for results in (without, method))
+    known = mean(method, "known_suns", "image", "psnr")
+    cells: common.Row = {"no shadows": base.mean(), "PSNR": ours.mean(), "gain": (ours - base).mean()}
+    if len(ours) > 1:
+        cells["gain, deviation"] = (ours - base).std(ddof=1)
+    cells["gap"] = (known - ours).mean()
+    cells["BER, no shadows"] = mean(without, "unseen_suns", "shadow", "ber").mean()
+    cells["BER"] = mean(method, "unseen_suns", "shadow", "ber").mean()
+    cells["mask error"] = mean(method, "unseen_suns", "shadow_mask", "error_rate").mean()
+    cells = {key: round(float(value), 4) for key, value in cells.items()}
+    return cells | {"Gaussians": int(np.mean([result["model"]["gaussians"] for result in method]))}
+
+
+def mean(results: list[common.Row], part: str, group: str, metric: str) -> np.ndarray:
+    """The metric's mean over frames of known or unseen Suns, of each training; NaN where it has none."""
+    found = [(((result.get(part) or {}).get(group) or {}).get(metric) or {}).get("mean") for result in results]
+    return np.array([np.nan if value is None else value for value in found], float)
+
+
+if __name__ == "__main__":
+    common.run_main(main)
