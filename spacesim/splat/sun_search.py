@@ -22,9 +22,10 @@ from spacesim.data.geometry import Array, degrees_between, fibonacci_sphere
 from spacesim.data.images import linear_from_srgb, luminance
 from spacesim.data.images.tone import Curve
 from spacesim.data.records import Camera, Image
-from spacesim.splat.light.model import LightModel, Sunlight
+from spacesim.splat.light.model import LightModel
 from spacesim.splat.light.shadow.cast import ShadowConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
+from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.render import render

@@ -19,9 +19,10 @@ from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
 from spacesim.data.images.tone import Curve
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.model import Sunlight, robust_radius
+from spacesim.splat.light.model import robust_radius
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
+from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import ALPHA_MIN

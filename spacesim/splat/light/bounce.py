@@ -105,11 +105,9 @@ def grazing_reflectance_slope(specular: Float) -> Float:
     return dr.select(specular < GLASS, ad.Float(1 / GLASS), 0)
 
 
-def scattering(
-    scatterers: Scatterers, count: int, radiance: Callable[[UInt32], list[Float]], batch: PaddedBatch
-) -> list[Float]:
-    """Emitters as `irradiance` and `mirrored` read them: `count` of the Gaussians, evenly chosen by number, each in
-    place of N / count. radiance: of which Gaussians [count] to the light that they scatter, RGB
+def scattering(scatterers: Scatterers, count: int, light: list[Float], batch: PaddedBatch) -> list[Float]:
+    """Emitters as `irradiance` and `mirrored` read them: `count` of the Gaussians, evenly `chosen` by number, each in
+    place of N / count. light: that they scatter, RGB, Floats [count]
 
     Area: 2 pi s_1 s_2 opacity, of its two longer axes, times N / count, times `OVERLAP`.
     """
@@ -121,16 +119,17 @@ def scattering(
     opacity = opacities(dr.gather(ad.Float, scatterers.logit_opacities, k))
     each = ad.Float(batch.count) / count
     area = 2 * dr.pi * OVERLAP * each * opacity * dr.exp(dr.sum(log_scales) - least)
-    numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *radiance(k)]
+    numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *light]
     sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     packed = [store(values, index, count) for values in packets([dr.select(sound, number, 0) for number in numbers])]
     dr.eval(packed)
     return packed
 
 
-def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, gaussians: UInt32) -> list[Float]:
-    """rho_k v_k |n_k . s| of Gaussians k, three Floats as wide. visibility: [M] in a list, or nothing for 1;
-    gaussians: N"""
+def albedo_radiance(scatterers: Scatterers, visibility: list[Float], count: int, gaussians: UInt32) -> list[Float]:
+    """rho_k v_k |n_k . s| of the Gaussians k that are `chosen`, three Floats [count]. visibility: [M] in a list, or
+    nothing for 1;  gaussians: N"""
+    k = chosen(dr.arange(ad.UInt32, count), count, gaussians)
     seen = dr.dot(lit_normals(scatterers, k, gaussians), scatterers.sun)
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)

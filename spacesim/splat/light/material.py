@@ -16,7 +16,8 @@ from spacesim.backend.memory import check_memory
 from spacesim.data.geometry import Array, look_at
 from spacesim.data.images.tone import Tone, linear_from_display
 from spacesim.splat.light.field import FieldConfig
-from spacesim.splat.light.model import LightModel, Sunlight
+from spacesim.splat.light.model import LightModel
+from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
 

@@ -6,7 +6,7 @@ as given, and so do shadows, as in the literature, unless `ShadowConfig.gradient
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import drjit as dr
@@ -24,13 +24,13 @@ from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
-from spacesim.splat.light.shading import ShadingInputs, ShadingTape, SunEncoding, split_weights
+from spacesim.splat.light.shading import ShadingInputs, ShadingTape, split_weights
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
+from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.tone import decode_srgb
 
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
@@ -65,24 +65,6 @@ def _from_median(means: Array) -> Array:
 
 def _radius_within(away: Array) -> float:
     return max(float(np.quantile(away, 0.99)), 1e-9)
-
-
-@dataclass
-class Sunlight:
-    """What of a Sun's light no camera changes."""
-
-    visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
-    bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
-    #: of `bounce.scattering`, where surfaces mirror them, or nothing
-    emitters: list[Float] = field(default_factory=list)
-    mirrored: list[Float] = field(default_factory=list)  #: what is left of that, a share [N] in a list, or nothing
-
-    def dimmed(self, share: Float, linear: bool) -> "Sunlight":
-        """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
-        visibility = share if self.visibility is None else self.visibility * share
-        of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
-        mirrored = [left * of_light for left in self.mirrored] or [of_light]
-        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitters, mirrored)
 
 
 @dataclass
@@ -220,7 +202,7 @@ class LightModel:
         of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun), of_picture)
         inputs = self._inputs(gaussians, None, terms, shadows)
-        visibility, bounced, emitters = kernels.sunlight(self.config, self.weights, inputs, batch)
+        visibility, bounced, emitters = kernels.cast_sunlight(self.config, self.weights, inputs, batch)
         return Sunlight(visibility[0] if visibility else None, bounced, emitters)
 
     def shade_picture(
@@ -244,20 +226,8 @@ class LightModel:
         terms = self._with_embedding(self.encode_sun(sun, earth), of_picture)
         inputs = self._inputs(gaussians, of_any_size, terms, None)
         of_field, _ = split_weights(self.config, self.weights)
-        visibility = [] if light.visibility is None else [light.visibility]
-        shown = kernels.shade_picture(
-            self.config,
-            of_field,
-            inputs,
-            batch,
-            cache.first_layer,
-            cache.packed,
-            visibility,
-            light.bounced,
-            light.emitters,
-            light.mirrored,
-        )
-        return shown[:3], shown[3] if visibility else None
+        shown = kernels.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
+        return shown[:3], None if light.visibility is None else shown[3]
 
     def adjoint(
         self, shading: Shading, grad_color: list[Float], grad_visibility: Float | None = None, by_sun: bool = False

@@ -11,7 +11,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf, UInt32
 from spacesim.learning import mlp
 from spacesim.learning.mlp import round_up_rows
-from spacesim.learning.reflectance import past_earth, surface_cosines
+from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import (
     Scatterers,
@@ -46,32 +46,12 @@ from spacesim.splat.light.shadow.refine import (
     refine_occlusion,
     refine_occlusion_slope,
 )
+from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import across
 from spacesim.splat.raster.tone import decode_srgb
 
 SIDES = 4  #: from which what bounces is seen where it comes from
-
-
-@dataclass
-class SunEncoding:
-    """A Sun as the kernels read it, Floats."""
-
-    light_axes: Float  #: [9], `light_rows`
-    field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
-    refine_encoding: Float  #: input of the refinement's network
-    beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
-    eclipse: list[Float]  #: where the Earth hides some of the Sun, Float [2] of `eclipse_numbers` in a list, or nothing
-
-    def left(self, light: list[Float]) -> list[Float]:
-        """What the Earth leaves of sunlight [M]."""
-        return [value * dr.gather(ad.Float, left, ad.UInt32(0)) for left in self.eclipse for value in light] or light
-
-    def colors_left(self, colors: list[Float]) -> tuple[list[Float], list[Float]]:
-        """`past_earth` of colours [M], which are as they were where there is no eclipse."""
-        for numbers in self.eclipse:
-            return past_earth(colors, numbers)
-        return colors, [ad.Float(1) for _ in colors]
 
 
 @dataclass
@@ -132,14 +112,9 @@ def shade_picture(
     batch: PaddedBatch,
     first_layer: mlp.PartialLayer | None,
     packed: cooperative.PackedNetwork,
-    visibility: list[Float],
-    bounced: list[Float],
-    emitters: list[Float],
-    mirrored: list[Float],
+    sunlight: Sunlight,
 ) -> list[Float]:
-    """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`;  visibility: [N]
-    in a list, or nothing;  bounced, emitters, mirrored: see
-    `model.Sunlight`"""
+    """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
     field, field_inputs = config.field, _field_inputs(inputs)
     views = field_views(field, field_inputs, batch)
     if first_layer:
@@ -151,10 +126,11 @@ def shade_picture(
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
     colors = [mlp.sigmoid(value) for value in outputs]
     faces = sun_facing(field, field_inputs, views, batch)
-    shown = _dimmed(inputs.sun, colors, [batch.pad_zeros(value) for value in visibility], faces)
-    arriving = inputs.sun.left([batch.pad_zeros(light) for light in bounced])
-    scattered = _scattered(config, inputs, arriving, emitters, batch)
-    for share in mirrored:
+    visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
+    shown = _dimmed(inputs.sun, colors, visibility, faces)
+    arriving = inputs.sun.left([batch.pad_zeros(light) for light in sunlight.bounced])
+    scattered = _scattered(config, inputs, arriving, sunlight.emitters, batch)
+    for share in sunlight.mirrored:
         scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
@@ -163,10 +139,10 @@ def shade_picture(
 
 
 @recorded
-def sunlight(
+def cast_sunlight(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
 ) -> tuple[list[Float], list[Float], list[Float]]:
-    """([refined visibility [N]] or [], light that bounces and its emitters, see `model.Sunlight`)."""
+    """([refined visibility [N]] or [], light that bounces and its emitters, see `Sunlight`)."""
     field_weights, refine_weights = split_weights(config, weights)
     visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
     dr.eval(visibility)
@@ -333,13 +309,11 @@ def _bounce(
     if not config.bounce:
         return [], []
     scatterers = _scatterers(config, inputs)
-
-    def radiance(k: UInt32) -> list[Float]:
-        if config.mirrors:
-            return _painted(config, weights, inputs, visibility, batch.count)
-        return albedo_radiance(scatterers, visibility, k, batch.count)
-
-    emitters = scattering(scatterers, config.bounce, radiance, batch)
+    if config.mirrors:
+        light = _painted(config, weights, inputs, visibility, batch.count)
+    else:
+        light = albedo_radiance(scatterers, visibility, config.bounce, batch.count)
+    emitters = scattering(scatterers, config.bounce, light, batch)
     return irradiance(scatterers, emitters, config.bounce, batch), emitters if config.mirrors else []
 
 

@@ -13,7 +13,8 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, check_camera
-from spacesim.splat.light.model import LightModel, Sunlight
+from spacesim.splat.light.model import LightModel
+from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.render import RenderOutput, render

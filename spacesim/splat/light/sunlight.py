@@ -1,0 +1,49 @@
+"""A Sun as the kernels of light read it, and what of its light no camera changes."""
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Float
+from spacesim.learning.reflectance import past_earth
+from spacesim.splat.raster.tone import decode_srgb
+
+
+@dataclass
+class SunEncoding:
+    """A Sun as the kernels read it, Floats."""
+
+    light_axes: Float  #: [9], `light_rows`
+    field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
+    refine_encoding: Float  #: input of the refinement's network
+    beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
+    eclipse: list[Float]  #: where the Earth hides some of the Sun, Float [2] of `eclipse_numbers` in a list, or nothing
+
+    def left(self, light: list[Float]) -> list[Float]:
+        """What the Earth leaves of sunlight [M]."""
+        return [value * dr.gather(ad.Float, left, ad.UInt32(0)) for left in self.eclipse for value in light] or light
+
+    def colors_left(self, colors: list[Float]) -> tuple[list[Float], list[Float]]:
+        """`past_earth` of colours [M], which are as they were where there is no eclipse."""
+        for numbers in self.eclipse:
+            return past_earth(colors, numbers)
+        return colors, [ad.Float(1) for _ in colors]
+
+
+@dataclass
+class Sunlight:
+    """What of a Sun's light no camera changes."""
+
+    visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
+    bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
+    #: of `bounce.scattering`, where surfaces mirror them, or nothing
+    emitters: list[Float] = field(default_factory=list)
+    mirrored: list[Float] = field(default_factory=list)  #: what is left of that, a share [N] in a list, or nothing
+
+    def dimmed(self, share: Float, linear: bool) -> "Sunlight":
+        """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
+        visibility = share if self.visibility is None else self.visibility * share
+        of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
+        mirrored = [left * of_light for left in self.mirrored] or [of_light]
+        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitters, mirrored)
