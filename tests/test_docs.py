@@ -101,12 +101,12 @@ def test_links_and_anchors_lead_somewhere(document):
 
 def test_pictures_are_shown():
     shown = {Path(name).name for page in DOCUMENTS for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text())}
-    assert {path.name for path in DOCS.glob("pictures/*") if path.suffix in (".png", ".svg")} == shown
+    assert {path.name for path in DOCS.glob("pictures/*") if path.suffix in (".png", ".svg", ".webp")} == shown
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=of)
 def test_documents_that_the_code_names_are_there(source):
-    named = re.findall(r"\bdocs/[\w/.-]+\.(?:md|py|png|svg)\b", source.read_text(encoding="utf-8"))
+    named = re.findall(r"\bdocs/[\w/.-]+\.(?:md|py|png|svg|webp)\b", source.read_text(encoding="utf-8"))
     assert [name for name in named if name not in KNOWN and not (ROOT / name).exists()] == []
 
 
