@@ -140,8 +140,6 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     label, views = ("one view", 1) if splatted.views_per_step > 1 else ("two views", 2)
     yield f"splat, surface, {label} a step", replace(splatted, views_per_step=views)
     yield "none, surface, finer", finer(relit)
-    yield "splat, surface, finer", finer(splatted)
-    yield "splat, surface, finer, supervised, gradients", finer(both)
 
 
 def finer(config: TrainConfig) -> TrainConfig:

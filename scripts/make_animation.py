@@ -17,7 +17,8 @@ from spacesim import backend
 from spacesim.data.geometry import look_at
 from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
-from spacesim.eval.pictures import as_bytes
+from spacesim.eval.pictures import WRONGLY_LIT, WRONGLY_SHADOWED, as_bytes, shadow_picture
+from spacesim.learning.pictures import LIT, SHADOWED
 from spacesim.scenes import read_scene
 from spacesim.scenes.build import build
 from spacesim.scenes.render import Renderer
@@ -28,16 +29,10 @@ TOP = 72  #: rows of pixels that are cut off above, and below
 FRAMES, MILLISECONDS = 48, 120  #: of a round; of a frame
 ELEVATION = 30.0  #: of the Sun, degrees
 SPP = 256
-FOV = 31.0  #: degrees
+FOV = 33.0  #: degrees
 PLACE = 7.2, -4.4, 3.2  #: of the camera, metres
 INK, DIM = (235, 235, 230), (150, 155, 165)
-LIT, DARK, MISSED, EXTRA = (96, 96, 92), (44, 44, 46), (213, 94, 0), (86, 180, 233)
-LEGEND = (
-    ("both lit", (170, 170, 165)),
-    ("both dark", (110, 110, 112)),
-    ("shadow missed", MISSED),
-    ("shadow too many", EXTRA),
-)
+LEGEND = {"lit": LIT, "in shadow": SHADOWED, "wrongly lit": WRONGLY_LIT, "wrongly shadowed": WRONGLY_SHADOWED}
 
 Panel = np.ndarray
 """[H, W, 3] uint8."""
@@ -53,19 +48,11 @@ def main(run: Run, out: Path) -> None:
         truth, found = renderer.render(camera, sun, (0, number)), run.predict(camera, sun)
         assert found.visibility is not None, "expected a run that casts shadows"
         picture = srgb_from_linear(np.clip(truth.radiance * config.camera.exposure, 0, 1))
-        shadows = differences(truth.sun_visibility > 0.5, found.visibility > 0.5, truth.object_id > 0)
+        shadows = shadow_picture(found.visibility <= 0.5, truth.sun_visibility <= 0.5, truth.object_id > 0)
         panels = [as_bytes(picture), as_bytes(np.clip(found.rgb, 0, 1)), shadows]
         frames.append(joined(panels, f"Sun at {azimuth:.0f}°, {ELEVATION:.0f}° up"))
     frames[0].save(out, save_all=True, append_images=frames[1:], duration=MILLISECONDS, loop=0, quality=60, method=6)
     print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")
-
-
-def differences(lit: np.ndarray, seen: np.ndarray, surface: np.ndarray) -> Panel:
-    """What is lit in truth and as the run sees it, [H, W] bool each, where there is a surface."""
-    picture = np.zeros((*lit.shape, 3), np.uint8)
-    for where, color in ((lit & seen, LIT), (~lit & ~seen, DARK), (~lit & seen, MISSED), (lit & ~seen, EXTRA)):
-        picture[where & surface] = color
-    return picture
 
 
 def joined(panels: list[Panel], caption: str) -> Image.Image:
@@ -82,9 +69,10 @@ def joined(panels: list[Panel], caption: str) -> Image.Image:
         draw.text((x, 7), title, INK, large)
         x += draw.textlength(title, large) + 14
         draw.text((x, 11), more, DIM, small)
-    for word, color in LEGEND:
-        draw.text((x, 11), word, color, small)
-        x += draw.textlength(word, small) + 14
+    for word, color in LEGEND.items():
+        draw.rectangle((x, 12, x + 10, 22), color)
+        draw.text((x + 16, 11), word, DIM, small)
+        x += draw.textlength(word, small) + 28
     return canvas
 
 

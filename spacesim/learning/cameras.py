@@ -16,14 +16,6 @@ def nearest_camera(dataset: Dataset, center: np.ndarray) -> float:
     return float(min(np.linalg.norm(frame.camera.position - center) for frame in dataset.train))
 
 
-def middle_picture_width(dataset: Dataset) -> float:
-    """Metres that the longer side of a training picture shows at `focus_point`: the median over all."""
-    center, cameras = focus_point(dataset), [frame.camera for frame in dataset.train]
-    sides = [max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras]
-    away = [np.linalg.norm(camera.position - center) for camera in cameras]
-    return float(np.median(np.multiply(away, sides)))
-
-
 def focus_point(dataset: Dataset) -> np.ndarray:
     """[3] the point nearest to all optical axes, in the least-squares sense."""
     return focus_of(np.array([frame.camera.world_from_camera for frame in dataset.train]))

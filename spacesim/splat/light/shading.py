@@ -198,8 +198,8 @@ def adjoint(
     by_sun: bool,
 ) -> tuple[Float, list[Float], list[Float], list[Float], list[Float]]:
     """(gradient of the features, gradients of the weights, [gradient of the raw occlusion] where it is asked for,
-    [gradient of `SunEncoding.field`] where pictures have embeddings, [gradient of the Sun's direction, Float [3]] where
-    `by_sun` asks for it)."""
+    [gradient of `SunEncoding.field_encoding`] where pictures have embeddings, [gradient of the Sun's direction, Float
+    [3]] where `by_sun` asks for it)."""
     field_weights, refine_weights = split_weights(config, weights)
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]

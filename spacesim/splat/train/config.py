@@ -163,8 +163,12 @@ class TrainConfig:
 
     @property
     def holds_sizes(self) -> bool:
-        """Whether no Gaussian gets larger than those that `refinement` splits."""
-        return self.refinement.split_screen == "held" and not hasattr(self.strategy, "reads")
+        """Whether no Gaussian gets larger than those that `refinement` splits: not of a strategy that splits by other
+        rules (`reads`), nor in a training too short to split any."""
+        refinement = replace(self.refinement, refine_stop=self.refine_stop)
+        steps = range(0, self.refine_stop, refinement.refine_every)
+        is_split = not hasattr(self.strategy, "reads") and any(refinement.refines_at(step) for step in steps)
+        return is_split and refinement.split_screen == "held"
 
     def downscale(self, step: int) -> int:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""

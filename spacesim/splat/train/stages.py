@@ -19,9 +19,8 @@ from spacesim.splat.raster.tone import decode_srgb, inverse_tone_map, mu_law, to
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.loss.photometric import photometric_loss
 from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, visibility_loss
+from spacesim.splat.train.start import RADIUS
 from spacesim.splat.train.warm_start import foreground_loss
-
-RADIUS = 3  #: of a splat on the screen, standard deviations
 
 
 def project_views(

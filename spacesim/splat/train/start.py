@@ -10,6 +10,7 @@ from spacesim.data.mesh import read_mesh
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point, nearest_camera
+from spacesim.splat.light.model import is_near
 from spacesim.splat.raster.cameras import NEAR
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.surface import flattened
@@ -24,6 +25,8 @@ CUT_AWAY = 0.02  #: least share of a picture's pixels that are empty or ignored,
 FEATURES = 0.3  #: standard deviation of the features at the start
 SOME_POINTS = 5_000  #: of a dataset, that say how near its cameras are
 CUT_OFF = 1e-3  #: share of the points before cameras that may be too near to be drawn
+RADIUS = 3  #: of a splat on the screen, standard deviations (rho of thesis 5.4)
+COVER = 2  #: times that Gaussians cover a surface, at least, whose sizes are held
 SPLATFACTO_CUBE = 10  #: scene scales, side of the cube that its random start fills (`random_scale`)
 
 
@@ -112,6 +115,21 @@ def gaussians_at(means: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gauss
             "sh": sh,
         }
     )
+
+
+def largest_scale(dataset: Dataset, gaussians: Gaussians, share: float, count: int) -> float:
+    """Metres: the standard deviation of which `RADIUS` are a `share` of the longer side of a picture, seen from the
+    training cameras' median distance to the middle of `gaussians`, those of the start. It is larger where `count` of
+    them would not cover `COVER` times the surface that these lie on, each with 2 pi times its square.
+
+    Of points spread at random over a plane the mean distance to three neighbours, squared, is 0.53 of the area of each.
+    """
+    arrays = gaussians.to_numpy()
+    middle = np.median(arrays["means"], axis=0)
+    cameras = [frame.camera for frame in dataset.train]
+    seen = [max(c.width, c.height) / c.fx * np.linalg.norm(c.position - middle) for c in cameras]
+    surface = np.exp(2.0 * arrays["log_scales"][is_near(arrays["means"]), 1]).sum() / 0.53
+    return float(max(share * np.median(seen) / RADIUS, np.sqrt(COVER * surface / (2 * np.pi * count))))
 
 
 def scene_scale(dataset: Dataset) -> float:

@@ -21,7 +21,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
 from spacesim.learning.adam import NetworkAdam
-from spacesim.learning.cameras import farthest_camera, focus_point, middle_picture_width, nearest_camera
+from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
 from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
@@ -38,8 +38,8 @@ from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import RADIUS, TargetImage, update_light
-from spacesim.splat.train.start import initial_gaussians, lay_flat, scene_scale, surface_normals
+from spacesim.splat.train.stages import TargetImage, update_light
+from spacesim.splat.train.start import initial_gaussians, largest_scale, lay_flat, scene_scale, surface_normals
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
@@ -63,7 +63,7 @@ class Trainer(TrainingLoop):
         _check_sizes(dataset, config)
         self.views = _views(dataset, config)
         self.pictures = LearnedPictures(dataset, config, first_suns, poses)
-        self.scene_scale, self._picture_width = scene_scale(dataset), middle_picture_width(dataset)
+        self.scene_scale = scene_scale(dataset)
         features = config.light.features if config.light else 0
         count = min(config.init_count, config.refinement.max_gaussians)
         self.gaussians = initial_gaussians(
@@ -76,6 +76,10 @@ class Trainer(TrainingLoop):
             box=config.init_box,
             like_splatfacto=config.splatfacto_start,
         )
+        self._held: list[float] = []  # ln of metres
+        if config.holds_sizes:
+            share, most = config.refinement.split_screen_size, config.refinement.max_gaussians
+            self._held = [math.log(largest_scale(dataset, self.gaussians, share, most))]
         if config.surfels:
             lay_flat(self.gaussians)
         self.optimizer = Adam(self.gaussians.rows())
@@ -214,11 +218,11 @@ class Trainer(TrainingLoop):
         self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties(), self._largest_scale())
 
     def _largest_scale(self) -> list[Float]:
-        """ln of metres, once Gaussians grow in number, of a configuration that holds their sizes; else nothing."""
+        """ln of `largest_scale`, once Gaussians are split, of a configuration that holds their sizes; else nothing."""
         refinement, index = self.config.refinement, self.iteration
-        if not self.config.holds_sizes or index < refinement.refine_start or self._warming(index):
+        if index < max(refinement.refine_start, refinement.pause_after_reset) or self._warming(index):
             return []
-        return [dr.opaque(ad.Float, math.log(refinement.split_screen_size * self._picture_width / RADIUS))]
+        return [dr.opaque(ad.Float, number) for number in self._held]
 
     def _penalties(self) -> dict[str, Float]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""

@@ -15,6 +15,7 @@ from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
 from spacesim.data.lock import lock_folder
+from spacesim.data.records import Camera
 from spacesim.data.store import read_points, write_points
 from spacesim.learning.cameras import focus_point
 from spacesim.splat.export.ply import read_ply, write_ply
@@ -26,14 +27,18 @@ from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig, preset, with_options
 from spacesim.splat.train.start import (
+    COVER,
+    RADIUS,
     distance_warning,
     gaussians_at,
     initial_gaussians,
+    largest_scale,
     lay_flat,
     scale_warning,
     scene_scale,
 )
 from spacesim.splat.train.strategies.control import DensificationConfig
+from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 from spacesim.splat.train.warm_start import WarmStartConfig
@@ -232,6 +237,35 @@ def test_backgrounds_are_random_and_black_behind_opaque_pictures_unless_as_splat
     assert preset("thesis").random_background
     assert preset("thesis").random_behind_opaque
     assert not preset("fine").random_behind_opaque
+
+
+def test_the_largest_scale_is_one_of_pictures_or_covers_the_surface(small_dataset):
+    """Of a plate of 4 square metres, 5 metres before one camera that stands at the origin and looks along z."""
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 5]
+    gaussians = gaussians_at(points, np.full((3000, 3), 0.5), 0)
+    camera = Camera.from_fov(np.eye(4), 300, 200, 60)
+    frame = replace(small_dataset.train[0], camera=camera)
+    dataset = replace(small_dataset, train=(frame,))
+    width = 2 * 5 * np.tan(np.radians(30))
+    assert largest_scale(dataset, gaussians, 0.01, 10**6) == pytest.approx(0.01 * width / RADIUS, rel=0.01)
+    for few in (100, 1000):
+        covered = few * 2 * np.pi * largest_scale(dataset, gaussians, 0.01, few) ** 2
+        assert covered == pytest.approx(COVER * 4, rel=0.15)
+
+
+def test_sizes_are_held_while_gaussians_are_split(small_lit_dataset):
+    refinement = replace(REFINEMENT, split_screen="held", split_screen_size=0.02, max_gaussians=2000)
+    config = replace(CONFIG, light=preset("demo", "shadow-splat").light, surfels=True, refinement=refinement)
+    trainer = Trainer(small_lit_dataset, config)
+    bound = np.float32(np.log(largest_scale(small_lit_dataset, trainer.gaussians, 0.02, 2000)))
+    widest = []
+    for _ in range(20):
+        trainer.step()
+        widest.append(np.array(trainer.gaussians.log_scales).max())
+    assert widest[9] > bound
+    np.testing.assert_array_equal(np.maximum(widest[10:], bound), bound)
+    for other in (replace(config, strategy=McmcConfig()), replace(config, iterations=10)):
+        assert not other.holds_sizes
 
 
 def test_a_start_like_splatfactos(small_dataset):

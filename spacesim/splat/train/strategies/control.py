@@ -33,8 +33,8 @@ class DensificationConfig:
     prune_scale: float = 0.05  #: larger ones are pruned (table 5.1)
     prune_screen_size: float = 0.05  #: wider ones are pruned, a share of the picture (table 5.1)
     split_screen_size: float = 0.01  #: wider ones are split, a share of the picture (table 5.1)
-    #: which of these: all, as gsplat; what grows by gradient (5.17); or all, the widest first, and none stays wider,
-    #: seen from the middle distance: a Gaussian has one visibility, so large ones blur the edges of shadows
+    #: which of these: all, as gsplat; what grows by gradient (5.17); or all, the widest first, and then none gets wider
+    #: (`largest_scale`): a Gaussian has one visibility, so large ones blur the edges of shadows
     split_screen: Literal["all", "growing", "held"] = "all"
     refine_every: int = 100  #: iterations between two densification steps (table 5.1)
     reset_every: int = 30  #: densification steps between two opacity resets (table 5.1)
@@ -226,14 +226,14 @@ class DensityControl(Strategy):
         large = statistics.scale > config.duplicate_scale * self.scene_scale
         high = statistics.gradient > self._thresholds(gaussians, statistics)
         split = high & large
-        score = statistics.gradient
+        first = np.zeros(len(split))
         if statistics.step < config.screen_size_stop:
             wide = statistics.radius > config.split_screen_size
             split |= wide & high if config.split_screen == "growing" else wide
             if config.split_screen == "held":
-                score = np.where(wide, score.max(initial=0) + statistics.radius, score)
+                first = np.where(wide, statistics.radius, 0)
         duplicate = high & ~large
-        return _limit(duplicate, split, score, config.max_gaussians - gaussians.count)
+        return _limit(duplicate, split, first, statistics.gradient, config.max_gaussians - gaussians.count)
 
 
 def select_parents(score: np.ndarray, eligible: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -256,13 +256,16 @@ def _largest_scale(gaussians: Gaussians) -> np.ndarray:
     return scales
 
 
-def _limit(duplicate: np.ndarray, split: np.ndarray, score: np.ndarray, budget: int) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the moves with the highest scores that add at most `budget` Gaussians; each adds one."""
+def _limit(
+    duplicate: np.ndarray, split: np.ndarray, first: np.ndarray, gradient: np.ndarray, budget: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the moves with the largest `first`, of equal ones those with the largest gradients, that add at most
+    `budget` Gaussians; each adds one."""
     chosen = np.flatnonzero(duplicate | split)
     added = duplicate.astype(np.int64) + split
     if added.sum() <= budget:
         return duplicate, split
-    order = chosen[np.argsort(-score[chosen], kind="stable")]
+    order = chosen[np.lexsort((-gradient[chosen], -first[chosen]))]
     keep = np.zeros_like(duplicate)
     keep[order[np.cumsum(added[order]) <= budget]] = True
     return duplicate & keep, split & keep

@@ -158,8 +158,8 @@ def test_splitting_by_size_can_ask_for_a_gradient():
 
 
 def test_where_sizes_are_held_the_widest_are_split_first():
-    """Of three that are wide and two whose gradients are high, within a budget of two more."""
-    radius, gradient = [0.0, 0.02, 0.03, 0.04, 0.0, 0.0], [0.5, 0.3, 0.0, 0.0, 0.0, 0.0]
+    """Of three that are wide and two whose gradients are high, one no number, within a budget of two more."""
+    radius, gradient = [0.0, 0.02, 0.03, 0.04, 0.0, 0.0], [0.5, 0.3, 0.0, np.nan, 0.0, 0.0]
     moved = {}
     for which in ("all", "held"):
         config = DensificationConfig(split_screen=which, split_screen_size=0.01, max_gaussians=8)
