@@ -22,7 +22,6 @@ from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.splat.train.config import METHODS, preset, with_options
 
-SCENE = {"spp": 64, "test_suns": 8, "test_views": 5, "known_test_views": 2, "shared_test_views": True}
 CRAFT = "boxsat", "telescope", "upper-stage", "cubesat", *craft.NAMES
 
 
@@ -50,7 +49,7 @@ def main() -> None:
 
 def rows_of(names: list[str], options: Any) -> Iterator[common.Row]:
     """A row for each craft."""
-    scene = {"suns": options.suns, "views": options.views, **SCENE, "test_spp": options.samples}
+    scene = {"suns": options.suns, "views": options.views, **common.KNOWN_AND_UNSEEN, "test_spp": options.samples}
     for name in names:
         folder = options.out / name
         path = craft.write(name, folder / "mesh") if name in craft.NAMES else alone(name, folder)
@@ -97,8 +96,7 @@ def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:
 
 def mean(results: list[common.Row], part: str, group: str, metric: str) -> np.ndarray:
     """The metric's mean over frames of known or unseen Suns, of each training; NaN where it has none."""
-    found = [(((result.get(part) or {}).get(group) or {}).get(metric) or {}).get("mean") for result in results]
-    return np.array([np.nan if value is None else value for value in found], float)
+    return np.array([common.number_in(result, part, group, metric, "mean") for result in results], float)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 
-SCENE = {"suns": 16, "views": 40, "test_suns": 8, "test_views": 5, "resolution": 256, "spp": 64, "test_spp": 1024}
+SCENE = {"suns": 16, "views": 40, "resolution": 256, "test_spp": 1024, **common.KNOWN_AND_UNSEEN}
 ROWS = ("thesis", "ours")
 SUNS = {"known": "known_suns", "unseen": "unseen_suns"}
 COLUMNS = (  # heading, group, metric, and what of it if not the mean
@@ -206,7 +206,7 @@ def refine_of(config: TrainConfig) -> ShadowRefinementConfig:
 
 def make_data(out: Path, **changes: Any) -> Path:
     """One boxsat under many Suns."""
-    return common.generated("boxsat", out, **{**SCENE, **changes}, known_test_views=2, shared_test_views=True)
+    return common.generated("boxsat", out, **{**SCENE, **changes})
 
 
 def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
@@ -215,8 +215,7 @@ def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
         return {"method": name, "Gaussians": metrics["note"]}
     cells: common.Row = {"method": name, "Gaussians": metrics["model"]["gaussians"]}
     for heading, group, metric, *what in COLUMNS:
-        value = ((metrics.get(part) or {}).get(group) or {}).get(metric)
-        number = None if value is None else value[what[0] if what else "mean"]
+        number = common.number_in(metrics, part, group, metric, what[0] if what else "mean")
         cells[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
     return cells
 

@@ -83,7 +83,7 @@ def summary(results: list[common.Row]) -> common.Row:
         return {"note": notes[0]}
     cells: common.Row = {}
     for heading, (group, metric, what) in COLUMNS.items():
-        values = [((result[group] or {}).get(metric) or {}).get(what) for result in results]
+        values = [common.number_in(result, group, metric, what) for result in results]
         found = [value for value in values if value is not None]
         if len(found) < len(results):
             continue

@@ -34,6 +34,13 @@ PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_s
 FIELD_OF_VIEW = 35  #: degrees
 CURVES = "#5a6472", "#b9560f", "#2a66ad", "#3d7a3a"  #: colours of a chart that stands alone
 DISTANCE = float(np.sqrt(18))  #: of the cameras from the centre of a sphere of radius 1: it fills most of the picture
+KNOWN_AND_UNSEEN = {  # of a dataset: its training Suns are tested, too, and 8 that none of its pictures is under
+    "spp": 64,
+    "test_suns": 8,
+    "test_views": 5,
+    "known_test_views": 2,
+    "shared_test_views": True,
+}
 
 Work = Callable[[], Any]
 Row = dict[str, Any]
@@ -135,6 +142,14 @@ def measured(
         **evaluated(run, truth or dataset, folder / "eval", evaluation, name, show_progress),
         "training": run.training,
     }
+
+
+def number_in(metrics: Row, *names: str) -> float | None:
+    """The number that stands under these names in a report, one within another; None where one of them has nothing."""
+    value: Any = metrics
+    for name in names:
+        value = (value or {}).get(name)
+    return value
 
 
 def standalone(drawn: str, names: Sequence[str]) -> str:

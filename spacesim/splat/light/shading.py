@@ -378,8 +378,8 @@ def _reflected(reflectances: list[Float], scattered: list[Float]) -> list[Float]
 
 def _reflected_slopes(reflectances: list[Float], scattered: list[Float]) -> list[Float]:
     """d `_reflected` by each reflectance."""
-    mirrored = zip(reflectances[3:], scattered[3:6], scattered[6:], strict=True)
-    slopes = [along + grazing_reflectance_slope(specular) * grazing for specular, along, grazing in mirrored]
+    rows = zip(reflectances[3:], scattered[3:6], scattered[6:], strict=True)
+    slopes = [along + grazing_reflectance_slope(specular) * grazing for specular, along, grazing in rows]
     return scattered[:3] + slopes
 
 

@@ -165,10 +165,10 @@ class TrainConfig:
     def holds_sizes(self) -> bool:
         """Whether no Gaussian gets larger than those that `refinement` splits: not of a strategy that splits by other
         rules (`reads`), nor in a training too short to split any."""
+        if self.refinement.split_screen != "held" or hasattr(self.strategy, "reads"):
+            return False
         refinement = replace(self.refinement, refine_stop=self.refine_stop)
-        steps = range(0, self.refine_stop, refinement.refine_every)
-        is_split = not hasattr(self.strategy, "reads") and any(refinement.refines_at(step) for step in steps)
-        return is_split and refinement.split_screen == "held"
+        return any(refinement.refines_at(step) for step in range(0, self.refine_stop, refinement.refine_every))
 
     def downscale(self, step: int) -> int:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""

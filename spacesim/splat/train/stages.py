@@ -42,8 +42,8 @@ def project_views(
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:
-    """Float [N], whole pixels: `RADIUS` along the longer axis on the screen (rho of thesis 5.4), 0 for
-    what is out of the picture. A Gaussian counts as seen where this is above 0, however faint it is: the `radii` of
+    """Float [N], whole pixels: `RADIUS` standard deviations along the longer axis on the screen (rho of thesis 5.4), 0
+    for what is out of the picture. A Gaussian counts as seen where this is above 0, however faint it is: the `radii` of
     gsplat 1.4. What the rasterizer skips is another matter (`Footprints.visible`)."""
     product = splats.a * splats.c
     determinant = dr.rcp(dr.maximum(product - dr.square(splats.b), 1e-7 * product))  # needles cancel

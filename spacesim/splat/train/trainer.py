@@ -76,10 +76,10 @@ class Trainer(TrainingLoop):
             box=config.init_box,
             like_splatfacto=config.splatfacto_start,
         )
-        self._held: list[float] = []  # ln of metres
+        self._held: list[Float] = []  # ln of metres
         if config.holds_sizes:
             share, most = config.refinement.split_screen_size, config.refinement.max_gaussians
-            self._held = [math.log(largest_scale(dataset, self.gaussians, share, most))]
+            self._held = [dr.opaque(ad.Float, math.log(largest_scale(dataset, self.gaussians, share, most)))]
         if config.surfels:
             lay_flat(self.gaussians)
         self.optimizer = Adam(self.gaussians.rows())
@@ -215,14 +215,13 @@ class Trainer(TrainingLoop):
     def _step_gaussians(self, degree: int, results: list[ViewResult]) -> None:
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
         views = [result.take_gradients() for result in results]
-        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties(), self._largest_scale())
+        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties(), self._held_now())
 
-    def _largest_scale(self) -> list[Float]:
-        """ln of `largest_scale`, once Gaussians are split, of a configuration that holds their sizes; else nothing."""
+    def _held_now(self) -> list[Float]:
+        """ln of `largest_scale` where the configuration holds sizes, once Gaussians may be split; else nothing."""
         refinement, index = self.config.refinement, self.iteration
-        if index < max(refinement.refine_start, refinement.pause_after_reset) or self._warming(index):
-            return []
-        return [dr.opaque(ad.Float, number) for number in self._held]
+        begins = max(refinement.refine_start, refinement.pause_after_reset)
+        return [] if index < begins or self._warming(index) else self._held
 
     def _penalties(self) -> dict[str, Float]:
         """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
