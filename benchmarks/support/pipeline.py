@@ -53,7 +53,7 @@ class Pipeline:
     def forward(self) -> None:
         """Lists to pixels."""
         self.blended = forward(self.splats, self.color, self.lists, *self.size, adjoint=True)
-        dr.eval(self.blended.features, self.blended.transmittance, self.blended.tile_last)
+        dr.eval(self.blended)
 
     def loss(self) -> None:
         """L1 + D-SSIM and the gradients of the pixels."""
@@ -76,7 +76,9 @@ class Pipeline:
     @property
     def blended_pairs(self) -> int:
         """Pairs that the tiles walk before all their pixels are opaque, at least one pixel of each being blended."""
-        last, start = np.array(self.blended.tile_last, np.int64), np.array(self.lists.start, np.int64)
+        state, start = self.blended.state, np.array(self.lists.start, np.int64)
+        assert state is not None
+        last = np.array(state.last, np.int64).reshape(len(start), -1).max(axis=1)
         return int(np.maximum(last - start, 0)[last > 0].sum())
 
 

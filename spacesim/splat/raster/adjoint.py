@@ -22,7 +22,7 @@ from spacesim.splat.raster.records import (
     ALPHA_MAX,
     LOG2_E,
     POWER_MIN,
-    BlendResult,
+    BlendState,
     bucket_numbers,
     exp2,
     exponents,
@@ -36,6 +36,7 @@ from spacesim.splat.raster.tiles import TileLists, TileShape, pixel_in_tile, thr
 
 COPIES_BYTES = 2**30  #: that copies of gradient slots, one a CPU thread, may take
 PACKET = 4  #: SIMD lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
+SLOTS = {"cuda": 8, "llvm": 1}  #: that a splat reads in a turn of its loop, all at once
 ONE_PIXEL = TileShape(1, 1, 1)
 
 
@@ -63,7 +64,7 @@ class SplatGradients:
 @recorded
 def by_tiles(
     splats: Splats,
-    blended: BlendResult,
+    state: BlendState,
     lists: TileLists,
     grad_planes: PlaneGradients,
     absolute: bool,
@@ -76,15 +77,15 @@ def by_tiles(
         inside = (thread.column + i < grad_planes.width) & (thread.row + j < grad_planes.height)
         pixel, place = (thread.row + j) * grad_planes.width + thread.column + i, thread.place * shape.pixels + p
         gradients.append([dr.gather(ad.Float, plane, pixel, inside) for plane in grad_planes.features])
-        end = dr.gather(ad.Float, blended.tile_transmittance, place)
+        end = dr.gather(ad.Float, state.transmittance, place)
         transmittance.append(end)
         behind.append(end * dr.gather(ad.Float, grad_planes.transmittance, pixel, inside))
-        last.append(dr.select(inside, dr.gather(ad.UInt32, blended.last, place), 0))
+        last.append(dr.select(inside, dr.gather(ad.UInt32, state.last, place), 0))
 
     sizes = packet_sizes(_numbers(channels, absolute))
     mode = reduce_mode(4 * sum(sizes) * lists.capacity, shape)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
-    records, start = blended.records, dr.gather(ad.UInt32, lists.start, thread.tile)
+    records, start = state.records, dr.gather(ad.UInt32, lists.start, thread.tile)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
@@ -123,7 +124,8 @@ def by_tiles(
         add_to_slots(slots, sums, lists.sum_index(k), mode)
         return k, transmittance, behind
 
-    first = dr.gather(ad.UInt32, blended.tile_last, thread.tile)
+    tile_last = dr.block_reduce(dr.ReduceOp.Max, state.last, shape.threads * shape.pixels)
+    first = dr.gather(ad.UInt32, tile_last, thread.tile)
     dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
     dr.eval(slots)
     return gather_slots(slots, splats, lists, channels, absolute)
@@ -197,7 +199,8 @@ class _Buckets:
 @recorded
 def by_buckets(
     splats: Splats,
-    blended: BlendResult,
+    features: list[Float],
+    state: BlendState,
     lists: TileLists,
     grad_planes: PlaneGradients,
     absolute: bool,
@@ -205,12 +208,12 @@ def by_buckets(
     """See `blend.backward`. A thread for a bucket: what lies behind a pair is all that the pixel shows, less what
     has been blended up to the pair."""
     channels, shape = len(grad_planes.features), lists.shape
-    pixels, bucket = shape.width * shape.height, blended.bucket
-    looks = _pixel_packets(blended, lists, grad_planes)
+    pixels, bucket = shape.width * shape.height, state.bucket
+    looks = _pixel_packets(features, state.transmittance, lists, grad_planes)
     tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
     number = dr.arange(ad.UInt32, bucket_count)
-    buckets = _buckets(blended, lists, number)
-    records = [_record(blended, buckets, i, lists.capacity) for i in range(bucket)]
+    buckets = _buckets(state, lists, number)
+    records = [_record(state, buckets, i, lists.capacity) for i in range(bucket)]
     until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
 
     def has_more(q: UInt32, _sums: object) -> Bool:
@@ -220,16 +223,16 @@ def by_buckets(
         column, row = pixel_in_tile(q, shape)
         px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
         total, *gradients = load(looks, buckets.tile * pixels + q, tiles * pixels)
-        transmittance, *shown = load(blended.checkpoints, number * pixels + q, bucket_count * pixels)
-        last = dr.gather(ad.UInt32, blended.last, buckets.tile * pixels + q)
+        transmittance, *shown = load(state.checkpoints, number * pixels + q, bucket_count * pixels)
+        last = dr.gather(ad.UInt32, state.last, buckets.tile * pixels + q)
         gradients, behind = gradients[:channels], total
         for gradient, feature in zip(gradients, shown, strict=False):
             behind = dr.fma(-gradient, feature, behind)
         sums = [list(of_pair) for of_pair in sums]
         for i, record in enumerate(records):
             blends = buckets.first + i < last
-            state = transmittance, behind
-            transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, state, blends, absolute)
+            pixel = transmittance, behind
+            transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, pixel, blends, absolute)
         return q + 1, sums
 
     zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
@@ -282,27 +285,25 @@ def _add_pixel(
     return transmittance - weight, behind
 
 
-def _buckets(blended: BlendResult, lists: TileLists, number: UInt32) -> _Buckets:
-    tile, shape = dr.gather(ad.UInt32, blended.bucket_tile, number), lists.shape
+def _buckets(state: BlendState, lists: TileLists, number: UInt32) -> _Buckets:
+    tile, shape = dr.gather(ad.UInt32, state.bucket_tile, number), lists.shape
     live = tile < lists.tiles_x * lists.tiles_y
     tile = dr.select(live, tile, 0)
     start = dr.gather(ad.UInt32, lists.start, tile)
-    first = start + (number - (start // blended.bucket + tile)) * blended.bucket
+    first = start + (number - (start // state.bucket + tile)) * state.bucket
     end = dr.select(live, dr.gather(ad.UInt32, lists.end, tile), 0)
     left, top = (tile % lists.tiles_x) * shape.width, (tile // lists.tiles_x) * shape.height
     return _Buckets(tile, live, ad.Float(left), ad.Float(top), first, end)
 
 
-def _record(blended: BlendResult, buckets: _Buckets, i: int, capacity: int) -> list[Float]:
+def _record(state: BlendState, buckets: _Buckets, i: int, capacity: int) -> list[Float]:
     """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
-    return load(blended.records, buckets.first + i, capacity, listed)
+    return load(state.records, buckets.first + i, capacity, listed)
 
 
 def _pixel_packets(
-    blended: BlendResult,
-    lists: TileLists,
-    grad_planes: PlaneGradients,
+    features: list[Float], transmittance: Float, lists: TileLists, grad_planes: PlaneGradients
 ) -> list[Float]:
     """Of each pixel, tile by tile, by fours: the scalar product of all that it shows, transmittance too, with their
     gradients; and its features' gradients."""
@@ -314,9 +315,9 @@ def _pixel_packets(
     inside = (column < width) & (row < height)
     pixel = row * width + column
     gradients = [dr.gather(ad.Float, plane, pixel, inside) for plane in grad_planes.features]
-    passed = dr.gather(ad.Float, blended.tile_transmittance, index)
+    passed = dr.gather(ad.Float, transmittance, index)
     total = passed * dr.gather(ad.Float, grad_planes.transmittance, pixel, inside)
-    for gradient, plane in zip(gradients, blended.features, strict=True):
+    for gradient, plane in zip(gradients, features, strict=True):
         total = dr.fma(gradient, dr.gather(ad.Float, plane, pixel, inside), total)
     values = [total, *gradients]
     values += [ad.Float(0)] * (-len(values) % 4)
@@ -350,12 +351,17 @@ def gather_slots(
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)
 
+    turn = SLOTS[select()]
+
     def remaining(position: UInt32, _sums: object) -> Bool:
         return position < end
 
     def add(position: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        values = load(slots, lists.sum_of_slot(position), lists.capacity)
-        return position + 1, [total + value for total, value in zip(sums, values, strict=True)]
+        for u in range(turn):
+            at = position + u
+            values = load(slots, lists.sum_of_slot(at), lists.capacity, at < end if u else True)
+            sums = [total + value for total, value in zip(sums, values, strict=True)]
+        return position + turn, sums
 
     numbers = sum(dr.width(array) for array in slots) // lists.capacity
     state = position, [ad.Float(0) for _ in range(numbers)]

@@ -335,7 +335,8 @@ def _stable_order(keys: UInt32, bits: int) -> UInt32:
     digit_bits = -(-bits // passes)
     order: Any = None
     for i in range(passes):
-        digit, last = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1), i == passes - 1
+        last = i == passes - 1
+        digit = (keys >> (i * digit_bits)) & ((1 << digit_bits) - 1) if passes > 1 else keys
         dr.eval(digit, order, None if last else keys)
         plain: Any = dr.detach(digit)  # `block_mkperm` is said to take other arrays
         moved = ad.UInt32(dr.detail.block_mkperm(plain, dr.width(keys), 1 << digit_bits))

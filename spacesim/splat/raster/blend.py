@@ -20,6 +20,7 @@ from spacesim.splat.raster.records import (
     POWER_MIN,
     TRANSMITTANCE_MIN,
     BlendResult,
+    BlendState,
     bucket_numbers,
     exp2,
     exponents,
@@ -30,7 +31,7 @@ from spacesim.splat.raster.records import (
 from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 
 BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
-BUCKET_TURN = 2  #: pairs a turn of the blending loop where buckets are kept: fewer turns have to ask for a new bucket
+TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
 CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
 
 
@@ -41,7 +42,7 @@ def forward(
 
     adjoint: keep what the backend's fastest `backward` reads; it costs memory, and can do without.
     """
-    bucket = _bucket(lists, len(features)) if adjoint else 0
+    bucket = _bucket(lists, len(features)) if adjoint else None
     return blend_lists(splats, features, lists, width, height, round_capacity(dr.width(splats.x)), bucket)
 
 
@@ -54,13 +55,19 @@ def _bucket(lists: TileLists, channels: int) -> int:
 
 @recorded(elements=lambda _, splats, features, lists, width, height, *_rest, **_named: width * height)
 def blend_lists(
-    splats: Splats, features: list[Float], lists: TileLists, width: int, height: int, capacity: int, bucket: int
+    splats: Splats,
+    features: list[Float],
+    lists: TileLists,
+    width: int,
+    height: int,
+    capacity: int,
+    bucket: int | None = None,
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for none"""
+    adjoint, 0 for that by tiles, None where there is none"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
-    turn = min(BUCKET_TURN, bucket) if bucket else 1
+    turn = TURN[select()]
     records = list_records(splats, features, lists, capacity)
     thread = thread_pixels(lists)
     start = dr.gather(ad.UInt32, lists.start, thread.tile)
@@ -112,24 +119,22 @@ def blend_lists(
         inside = (column < width) & (row < height)
         for plane, value in zip(planes, [transmittance[p], *sums[p]], strict=True):
             dr.scatter(plane, value, row * width + column, inside, dr.ReduceMode.NoConflicts)
-    tiled_transmittance, tiled_last = store(transmittance, thread.place, threads), store(last, thread.place, threads)
-    checkpoints, bucket_tile = (snapshots.states, snapshots.tile) if snapshots else ([], None)
-    dr.eval(planes, tiled_transmittance, tiled_last, checkpoints, bucket_tile)
-    return BlendResult(
-        features=planes[1:],
-        transmittance=planes[0],
-        tile_transmittance=tiled_transmittance,
-        last=tiled_last,
-        tile_last=dr.block_reduce(dr.ReduceOp.Max, tiled_last, shape.threads * pixels),
-        records=records,
-        bucket=bucket,
-        checkpoints=checkpoints,
-        bucket_tile=bucket_tile,
-    )
+    kept = None
+    if bucket is not None:
+        kept = BlendState(
+            transmittance=store(transmittance, thread.place, threads),
+            last=store(last, thread.place, threads),
+            records=records,
+            bucket=bucket,
+            checkpoints=snapshots.states if snapshots else [],
+            bucket_tile=snapshots.tile if snapshots else None,
+        )
+    dr.eval(planes, kept)
+    return BlendResult(planes[1:], planes[0], kept)
 
 
 class _Checkpoints:
-    """What the blending loop keeps of pixels before each bucket, see `BlendResult`.
+    """What the blending loop keeps of pixels before each bucket, see `BlendState`.
 
     thread (its place), start: [T * threads]"""
 
@@ -173,9 +178,11 @@ def backward(
     if lists.capacity == 0:
         zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
-    run = by_buckets if blended.bucket else by_tiles
+    assert blended.state is not None, "blending has kept nothing for its adjoint"
     grad_planes = PlaneGradients(*image_size, feature_gradients, transmittance_gradient)
-    return run(splats, blended, lists, grad_planes, absolute)
+    if blended.state.bucket:
+        return by_buckets(splats, blended.features, blended.state, lists, grad_planes, absolute)
+    return by_tiles(splats, blended.state, lists, grad_planes, absolute)
 
 
 class _Rasterize(dr.CustomOp):

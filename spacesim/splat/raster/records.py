@@ -21,24 +21,27 @@ _ROUNDING = 1.5 * 2.0**23  #: added to a float below 2^22, it leaves its integer
 
 
 @dataclass
-class BlendResult:
-    """What `forward` leaves behind. Planes are [height * width], row by row.
+class BlendState:
+    """What blending leaves behind for its way back. What is [T * pixels of a tile] is tile-major: a tile's pixels stand
+    thread by thread, a thread's as in `thread_offsets`."""
 
-    The rest is state for `backward`. What is [T * pixels of a tile] is tile-major: a tile's pixels stand thread by
-    thread, a thread's as in `thread_offsets`.
-    """
-
-    features: list[Float]  #: C planes, sum of w_i f_i
-    transmittance: Float  #: plane, what passes through all splats
-    tile_transmittance: Float  #: the same, [T * pixels of a tile]
+    transmittance: Float  #: what passes through all splats, [T * pixels of a tile]
     last: UInt32  #: one past the last pair blended of each pixel, [T * pixels of a tile]
-    tile_last: UInt32  #: the same of each tile, [T]
     records: list[Float]  #: the splats' records in list order, see `list_records`
     bucket: int  #: pairs of a bucket of the adjoint, 0 for none
     #: transmittance and sums of each pixel of a bucket's tile before the bucket, by fours, [4 B * pixels of a tile]
     #: each, without meaning where the pixel's thread did not reach it
     checkpoints: list[Float]
     bucket_tile: UInt32 | None  #: the tile of each bucket, [B], the number of tiles where no thread reached it
+
+
+@dataclass
+class BlendResult:
+    """What `forward` leaves behind. Planes are [height * width], row by row."""
+
+    features: list[Float]  #: C planes, sum of w_i f_i
+    transmittance: Float  #: plane, what passes through all splats
+    state: BlendState | None  #: for `backward`, where it was asked for
 
 
 def bucket_numbers(lists: TileLists, bucket: int) -> int:

@@ -49,19 +49,21 @@ def ordered_lists(
     place = cast(UInt32, dr.scatter_inc(lengths, members, members < lists))
     dr.eval(place, lengths, members, numbers, keys)
     end = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=False)
-    start, longest = end - lengths, dr.max(lengths)
-    dr.eval(start, end, longest)
+    start = end - lengths
+    dr.eval(start, end)
 
     entry = dr.arange(ad.UInt32, capacity)
     listed = members < lists
     place += dr.gather(ad.UInt32, start, members, listed)
     unordered = _packed([keys, numbers, entry, members], place, listed, capacity)
+    dr.eval(unordered)
 
     live = entry < dr.gather(ad.UInt32, end, ad.UInt32(lists - 1))
     entry_keys, first, last = _own(unordered, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
     rank = _count_before(unordered, entry_keys, chunk, dr.minimum(chunk + chunk_size, last))
     in_chunks = _packed(list(entry_keys), chunk + rank, live, capacity)
+    dr.eval(in_chunks)
 
     entry_keys, first, last = _own(in_chunks, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
@@ -73,18 +75,20 @@ def ordered_lists(
     number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
     dr.scatter(number, dr.select(live, entry_keys[1], 0), place)
     dr.scatter(source, dr.select(live, entry_keys[2], 0), place)
-    dr.eval(number, source, in_runs)
-    _merge_runs((number, source), in_runs, longest, start, end, run_size)
+    some_long = dr.zeros(ad.UInt32, 1)
+    dr.scatter(some_long, ad.UInt32(1), ad.UInt32(0), is_long)
+    dr.eval(number, source, in_runs, some_long)
+    _merge_runs((number, source), in_runs, some_long, start, end, run_size)
     return number, source, start, end
 
 
 def _merge_runs(
-    targets: tuple[UInt32, UInt32], entries: UInt32, longest: UInt32, start: UInt32, end: UInt32, run_size: int
+    targets: tuple[UInt32, UInt32], entries: UInt32, some_long: UInt32, start: UInt32, end: UInt32, run_size: int
 ) -> None:
     """Write numbers and sources of the lists longer than a run, whose runs are in order, in the order of the whole
-    list. One launch, which is over at once where there are none."""
+    list. One launch, which is over at once where there are none: some_long, of width 1, is 0."""
     lists = dr.width(end)
-    total = dr.select(longest > run_size, dr.gather(ad.UInt32, end, ad.UInt32(lists - 1)), 0)
+    total = dr.select(some_long > 0, dr.gather(ad.UInt32, end, ad.UInt32(lists - 1)), 0)
 
     def remaining(entry: UInt32) -> Bool:
         return entry < total
@@ -108,7 +112,6 @@ def _packed(values: list[UInt32], index: UInt32, active: Bool | bool, size: int)
     """A flat array [4 size] in which the four `values` of an element stand at its index."""
     target = dr.empty(ad.UInt32, 4 * size)
     dr.scatter(target, ad.Array4u(values), index, active=active)
-    dr.eval(target)
     return target
 
 

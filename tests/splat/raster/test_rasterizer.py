@@ -344,7 +344,8 @@ def adjoints(arrays, view, channels: int, absolute: bool, monkeypatch) -> list[n
     for limit in (rasterize.CHECKPOINT_BYTES, 0):
         monkeypatch.setattr(rasterize, "CHECKPOINT_BYTES", limit)
         blended = rasterize.forward(splats, features, lists, *size, adjoint=True)
-        assert bool(blended.bucket) == bool(limit)
+        assert blended.state is not None
+        assert bool(blended.state.bucket) == bool(limit)
         result = rasterize.backward(splats, blended, lists, size, weights[:-1], weights[-1], absolute)
         numbers = [getattr(result.splats, name) for name in ("x", "y", "a", "b", "c", "opacity")] + result.features
         assert (result.absolute_x is None) == (not absolute)

@@ -149,7 +149,7 @@ def _tested(
 def _mean_shadow_map(splats: Splats, lists: TileLists, camera: Orthographic, squares: bool, capacity: int) -> ShadowMap:
     """What the Sun sees of the Gaussians, with the second moments of depth if `squares`."""
     moments = [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
-    blended = blend_lists(splats, moments, lists, camera.width, camera.height, capacity, 0)
+    blended = blend_lists(splats, moments, lists, camera.width, camera.height, capacity)
     depth, *square = blended.features
     alpha = 1 - blended.transmittance
     dr.eval(alpha, depth, square)

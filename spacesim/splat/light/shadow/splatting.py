@@ -170,7 +170,7 @@ class _WalkResult:
     """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
 
     Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * threads * rows]; the
-    events' records in list order, see `records.BlendResult`.
+    events' records in list order, see `records.BlendState`.
     """
 
     occlusion: Float
