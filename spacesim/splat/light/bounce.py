@@ -17,6 +17,7 @@ from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.gaussians import opacities
 from spacesim.splat.raster.records import load, packets, store
+from spacesim.splat.raster.sort import segment_ids
 from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
@@ -105,20 +106,59 @@ def grazing_reflectance_slope(specular: Float) -> Float:
     return dr.select(specular < GLASS, ad.Float(1 / GLASS), 0)
 
 
-def scattering(scatterers: Scatterers, count: int, light: list[Float], batch: PaddedBatch) -> list[Float]:
-    """Emitters as `irradiance` and `mirrored` read them: `count` of the Gaussians, evenly `chosen` by number, each in
-    place of N / count. light: that they scatter, RGB, Floats [count]
+@dataclass
+class Chosen:
+    """Gaussians that scatter in place of all, [count] each."""
 
-    Area: 2 pi s_1 s_2 opacity, of its two longer axes, times N / count, times `OVERLAP`.
-    """
-    index = dr.arange(ad.UInt32, count)
-    k = chosen(index, count, batch.count)
+    number: UInt32  #: which, one maybe more than once
+    share: Float  #: of how many such as it is each stands for
+
+
+def choose(scatterers: Scatterers, visibility: list[Float], count: int, batch: PaddedBatch) -> Chosen:
+    """`count` of the N Gaussians, at even steps of the running sum of the sunlight that they catch, area v |n . s|
+    (systematic sampling), in whole numbers, so that the bits repeat; all, once each, where they are no more than that.
+    visibility: v [M] in a list, or nothing for 1"""
+    lit = dr.abs(dr.dot(_normals(scatterers, batch), scatterers.sun))
+    areas = _areas(batch.repeat_last(scatterers.log_scales), batch.repeat_last(scatterers.logit_opacities))
+    caught = lit * dr.minimum(areas, MAX_EMITTER_AREA)
+    for share in visibility:
+        caught *= share
+    column = dr.arange(ad.UInt32, batch.capacity)
+    caught = dr.select((column < batch.count) & (caught > 0), caught, 0)  # what is no number is not above 0
+    dr.eval(caught)
+    most = dr.max(caught)
+    weights = ad.UInt64(caught * (2.0**24 / dr.maximum(most, 1e-30)))
+    dr.eval(weights)
+    ends = dr.prefix_reduce(dr.ReduceOp.Add, weights, exclusive=False)
+    dr.eval(ends)
+    index, last = dr.arange(ad.UInt32, count), batch.count - 1
+    total = dr.gather(ad.UInt64, ends, last)
+    place = total * (2 * ad.UInt64(index) + 1) // (2 * count)
+    number = dr.minimum(segment_ids(ends, place, batch.capacity), last)
+    weight = ad.Float(dr.gather(ad.UInt64, weights, number))
+    share = dr.select(weight > 0, ad.Float(total) / (count * dr.maximum(weight, 1)), 0)
+    are_few = batch.count <= count
+    number = dr.select(are_few, dr.minimum(index, last), number)
+    share = dr.select(are_few, dr.select(index <= last, ad.Float(1), 0), share)
+    dr.eval(number, share)
+    return Chosen(number, share)
+
+
+def _areas(log_scales: Array3f, logit_opacities: Float) -> Float:
+    """m^2: 2 pi s_1 s_2 opacity, of the two longer axes, times `OVERLAP`."""
+    least = dr.minimum(log_scales[0], dr.minimum(log_scales[1], log_scales[2]))
+    return 2 * dr.pi * OVERLAP * opacities(logit_opacities) * dr.exp(dr.sum(log_scales) - least)
+
+
+def scattering(
+    scatterers: Scatterers, chosen: Chosen, count: int, light: list[Float], batch: PaddedBatch
+) -> list[Float]:
+    """Emitters as `irradiance` and `mirrored` read them: `count` `chosen` Gaussians, each as large as what it stands
+    for. light: that they scatter, RGB, Floats [count]"""
+    index, k = dr.arange(ad.UInt32, count), chosen.number
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
     normal = lit_normals(scatterers, k, batch.count)
-    least = dr.minimum(log_scales[0], dr.minimum(log_scales[1], log_scales[2]))
-    opacity = opacities(dr.gather(ad.Float, scatterers.logit_opacities, k))
-    each = ad.Float(batch.count) / count
-    area = 2 * dr.pi * OVERLAP * each * opacity * dr.exp(dr.sum(log_scales) - least)
+    area = chosen.share * _areas(log_scales, dr.gather(ad.Float, scatterers.logit_opacities, k))
     numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *light]
     sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     packed = [store(values, index, count) for values in packets([dr.select(sound, number, 0) for number in numbers])]
@@ -126,10 +166,9 @@ def scattering(scatterers: Scatterers, count: int, light: list[Float], batch: Pa
     return packed
 
 
-def albedo_radiance(scatterers: Scatterers, visibility: list[Float], count: int, gaussians: UInt32) -> list[Float]:
-    """rho_k v_k |n_k . s| of the Gaussians k that are `chosen`, three Floats [count]. visibility: [M] in a list, or
-    nothing for 1;  gaussians: N"""
-    k = chosen(dr.arange(ad.UInt32, count), count, gaussians)
+def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, gaussians: UInt32) -> list[Float]:
+    """rho_k v_k |n_k . s| of the Gaussians k, [count], three Floats. visibility: [M] in a list, or nothing for 1;
+    gaussians: N"""
     seen = dr.dot(lit_normals(scatterers, k, gaussians), scatterers.sun)
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)
@@ -181,9 +220,3 @@ def lit_normals(scatterers: Scatterers, k: UInt32, gaussians: UInt32) -> Array3f
     rows = [dr.gather(ad.Float, scatterers.features, (scatterers.normals + i) * gaussians + k) for i in range(3)]
     normal = unit_normals(ad.Array3f(rows))
     return dr.select(dr.dot(normal, scatterers.sun) < 0, -normal, normal)
-
-
-def chosen(index: UInt32, count: int, gaussians: UInt32) -> UInt32:
-    """Which of N `gaussians` the emitters `index` of `count` are."""
-    k = ad.UInt32((ad.Float(index) + 0.5) * (ad.Float(gaussians) / count))
-    return dr.minimum(k, gaussians - 1)

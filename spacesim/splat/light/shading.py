@@ -18,7 +18,7 @@ from spacesim.splat.light.bounce import (
     add_irradiance,
     add_irradiance_slopes,
     albedo_radiance,
-    chosen,
+    choose,
     grazing_reflectance,
     grazing_reflectance_slope,
     irradiance,
@@ -308,13 +308,14 @@ def _bounce(
     the field"""
     if not config.bounce:
         return [], []
-    scatterers = _scatterers(config, inputs)
+    scatterers, count = _scatterers(config, inputs), config.bounce
+    chosen = choose(scatterers, visibility, count, batch)
     if config.mirrors:
-        light = _painted(config, weights, inputs, visibility, batch.count)
+        light = _painted(config, weights, inputs, visibility, chosen.number, batch.count)
     else:
-        light = albedo_radiance(scatterers, visibility, config.bounce, batch.count)
-    emitters = scattering(scatterers, config.bounce, light, batch)
-    return irradiance(scatterers, emitters, config.bounce, batch), emitters if config.mirrors else []
+        light = albedo_radiance(scatterers, visibility, chosen.number, batch.count)
+    emitters = scattering(scatterers, chosen, count, light, batch)
+    return irradiance(scatterers, emitters, count, batch), emitters if config.mirrors else []
 
 
 def _painted(
@@ -322,17 +323,19 @@ def _painted(
     weights: list[Float],
     inputs: ShadingInputs,
     visibility: list[Float],
+    emitters: UInt32,
     gaussians: UInt32,
 ) -> list[Float]:
-    """The light of all emitters, three Floats, as the field paints them: mean of what is seen of each from four sides
-    at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the Sun.
+    """The light of the Gaussians that are `emitters`, three Floats, as the field paints them: mean of what is seen of
+    each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the
+    Sun.
 
     weights: of the field;  visibility: [M] in a list, or nothing for 1
     """
     field, count = config.field, config.bounce
     columns = PaddedBatch(gaussians, -(-SIDES * count // CHUNK) * CHUNK)
     column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
-    number, side = chosen(column // SIDES, count, gaussians), column % SIDES
+    number, side = dr.gather(ad.UInt32, emitters, column // SIDES), column % SIDES
     normals = lit_normals(_scatterers(config, inputs), number, gaussians)
     along = across(normals, towards_sun(inputs.sun.light_axes))
     sine, cosine = dr.sincos((ad.Float(side) + 0.5) * (2 * dr.pi / SIDES))

@@ -21,7 +21,7 @@ COMPARED = 2  #: entries compared in a turn of the loop
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
 
-def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32, count: int) -> UInt32:
+def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int) -> UInt32:
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
     segment_ends[i]; `count` for slots of no segment."""
     number, wide = type(segment_ends), type(segment_ends)(slot)

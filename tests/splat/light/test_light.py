@@ -182,11 +182,13 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> n
     features, first = arrays["features"].astype(np.float64), config.field.features
     normals = features[:, first : first + 3] / np.linalg.norm(features[:, first : first + 3], axis=1, keepdims=True)
     albedo, found = sigmoid(features[:, config.albedos : config.albedos + 3]), np.zeros((3, count, 3))
+    areas = 0.6 * np.pi * np.sort(np.exp(arrays["log_scales"]), axis=1)[:, 1:].prod(axis=1)
+    areas *= sigmoid(arrays["logit_opacities"])
+    caught = areas * visibility * np.abs(normals @ SUN)
     for number in range(config.bounce):
-        k = int((number + 0.5) * count / config.bounce)
+        k = np.searchsorted(np.cumsum(caught), (number + 0.5) / config.bounce * caught.sum())
         lit = normals[k] * np.sign(normals[k] @ SUN)
-        long = np.sort(np.exp(arrays["log_scales"][k]))[1:].prod()
-        area = 0.3 * count / config.bounce * 2 * np.pi * long * sigmoid(arrays["logit_opacities"][k])
+        area = areas[k] * caught.sum() / (config.bounce * caught[k])
         emitted = albedo[k] * visibility[k] * (lit @ SUN)
         if config.gloss:
             colors = visibility[k] * paint(np.full(4, k), four_sides(lit))
