@@ -44,44 +44,60 @@ class Scatterers:
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-def irradiance(scatterers: Scatterers, emitters: list[Float], count: int, batch: PaddedBatch) -> list[Float]:
-    """Light that arrives at each Gaussian: three Floats [M] at the side to which its normal points, three at the other;
-    1 where the light of all around is 1, as far as areas add up to surfaces (`OVERLAP`).
+Weights = Callable[[Array3f, Float], list[Float]]
+"""How much light of an emitter counts where it arrives: (unit direction towards it [3, M], w / pi, see `_seen_emitter`)
+to Floats [M]."""
+
+
+def received(
+    scatterers: Scatterers, emitters: list[Float], count: int, batch: PaddedBatch, *kinds: Weights
+) -> list[Float]:
+    """Light of all emitters that arrives at each Gaussian, three Floats [M], RGB, for each weight of each kind.
 
     emitters: of `scattering`, `count` of them
-
-    Sum over emitters k of their light times F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al. (1989), A its
-    area.
-    """
-    means, normals = batch.repeat_last(scatterers.means), _normals(scatterers, batch)
-
-    def received(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        towards, share, light = _seen_emitter(emitters, k, count, means)
-        here = dr.dot(normals, towards)
-        sides = share * dr.maximum(here, 0), share * dr.maximum(-here, 0)
-        return k + 1, [dr.fma(side, light[c], sums[3 * i + c]) for i, side in enumerate(sides) for c in range(3)]
-
-    return _sum_over(count, received, [dr.zeros(ad.Float, batch.capacity) for _ in range(6)])
-
-
-def mirrored(
-    scatterers: Scatterers, emitters: list[Float], count: int, direction: Array3f, batch: PaddedBatch
-) -> list[Float]:
-    """Light that each Gaussian mirrors towards the viewer, on the scale of `irradiance`: three Floats [M] per specular
-    reflectance at normal incidence, three per what it is at grazing incidence. direction: Array3f [3, M], unit, from
-    the camera;  emitters, count: as there
-
-    Sum over emitters k of their light times D n.l w / (4 (l.h)^2), the first with 1 - f, the others with f = (1 -
-    l.h)^5: facets of GGX (Walter et al. 2007) with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's
-    reflectance (1994); w = pi A cos_k / (pi r^2 + A) the angle that the emitter fills, h halfway between it and the
-    viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the emitter's own spread.
     """
     means = batch.repeat_last(scatterers.means)
+
+    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
+        return k < count
+
+    def add(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
+        towards, share, light = _seen_emitter(emitters, k, count, means)
+        weights = [weight for kind in kinds for weight in kind(towards, share)]
+        return k + 1, [dr.fma(weight, light[c], sums[3 * i + c]) for i, weight in enumerate(weights) for c in range(3)]
+
+    sums = [dr.zeros(ad.Float, batch.capacity) for _ in range(6 * len(kinds))]
+    return list(dr.while_loop((ad.UInt32(0), sums), has_more, add, mode="symbolic", label="bounce")[1])
+
+
+def irradiance(scatterers: Scatterers, batch: PaddedBatch) -> Weights:
+    """Light at the side to which a Gaussian's normal points, then at the other; 1 where the light of all around is 1,
+    as far as areas add up to surfaces (`OVERLAP`).
+
+    F = A cos_i cos_k / (pi r^2 + A), the disc of Wallace et al. (1989), A its area.
+    """
+    normals = _normals(scatterers, batch)
+
+    def at_sides(towards: Array3f, share: Float) -> list[Float]:
+        here = dr.dot(normals, towards)
+        return [share * dr.maximum(here, 0), share * dr.maximum(-here, 0)]
+
+    return at_sides
+
+
+def mirroring(scatterers: Scatterers, direction: Array3f, batch: PaddedBatch) -> Weights:
+    """Light that a Gaussian mirrors towards the viewer, on the scale of `irradiance`: per specular reflectance at
+    normal incidence, then per what it is at grazing incidence. direction: Array3f [3, M], unit, from the camera
+
+    D n.l w / (4 (l.h)^2), the first times 1 - f, the other times f = (1 - l.h)^5: facets of GGX (Walter et al. 2007)
+    with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's reflectance (1994); w = pi A cos_k / (pi r^2
+    + A) the angle that the emitter fills, h halfway between it and the viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi):
+    half of the emitter's own spread.
+    """
     normals = seen_side_normals(_normals(scatterers, batch), direction)
     view = -dr.dot(normals, direction)
 
-    def received(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        towards, share, light = _seen_emitter(emitters, k, count, means)
+    def mirrored(towards: Array3f, share: Float) -> list[Float]:
         here = dr.dot(normals, towards)
         both = dr.maximum(1 - dr.dot(towards, direction), 1e-6)  # 1 + l.v = 2 (l.h)^2
         alpha2 = 0.25 * share + ROUGHNESS**2
@@ -89,10 +105,9 @@ def mirrored(
         weight: Float = 0.5 * share * alpha2 * dr.maximum(here, 0) * dr.rcp(dr.square(spread) * both)
         beyond = 1 - dr.sqrt(0.5 * both)
         grazing: Float = weight * dr.square(dr.square(beyond)) * beyond
-        parts: list[Float] = [weight - grazing, grazing]
-        return k + 1, [dr.fma(part, light[c], sums[3 * i + c]) for i, part in enumerate(parts) for c in range(3)]
+        return [weight - grazing, grazing]
 
-    return _sum_over(count, received, [dr.zeros(ad.Float, batch.capacity) for _ in range(6)])
+    return mirrored
 
 
 def grazing_reflectance(specular: Float) -> Float:
@@ -153,7 +168,7 @@ def _areas(log_scales: Array3f, logit_opacities: Float) -> Float:
 def scattering(
     scatterers: Scatterers, chosen: Chosen, count: int, light: list[Float], batch: PaddedBatch
 ) -> list[Float]:
-    """Emitters as `irradiance` and `mirrored` read them: `count` `chosen` Gaussians, each as large as what it stands
+    """Emitters as `received` reads them: `count` `chosen` Gaussians, each as large as what it stands
     for. light: that they scatter, RGB, Floats [count]"""
     index, k = dr.arange(ad.UInt32, count), chosen.number
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
@@ -204,15 +219,6 @@ def _seen_emitter(emitters: list[Float], k: UInt32, count: int, means: Array3f) 
     away *= dr.rsqrt(dr.maximum(square, 1e-12))
     there = dr.maximum(-dr.dot(ad.Array3f(nx, ny, nz), away), 0)
     return away, area * there / dr.maximum(dr.fma(dr.pi, square, area), 1e-20), light
-
-
-def _sum_over(
-    count: int, received: Callable[[UInt32, list[Float]], tuple[UInt32, list[Float]]], sums: list[Float]
-) -> list[Float]:
-    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
-        return k < count
-
-    return list(dr.while_loop((ad.UInt32(0), sums), has_more, received, mode="symbolic", label="bounce")[1])
 
 
 def lit_normals(scatterers: Scatterers, k: UInt32, gaussians: UInt32) -> Array3f:

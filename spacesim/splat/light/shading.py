@@ -15,6 +15,7 @@ from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import (
     Scatterers,
+    Weights,
     add_irradiance,
     add_irradiance_slopes,
     albedo_radiance,
@@ -23,7 +24,8 @@ from spacesim.splat.light.bounce import (
     grazing_reflectance_slope,
     irradiance,
     lit_normals,
-    mirrored,
+    mirroring,
+    received,
     scattering,
 )
 from spacesim.splat.light.config import LightConfig
@@ -95,8 +97,9 @@ def shade(
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
-    bounced, emitters = _bounce(config, field_weights, inputs, [1 - value for value in occlusion], batch)
-    scattered = _scattered(config, inputs, inputs.sun.left(bounced), emitters, batch)
+    emitters = _emitters(config, field_weights, inputs, [1 - value for value in occlusion], batch)
+    light = _received(config, inputs, emitters, batch, config.mirrors)
+    scattered = _scattered(config, inputs, light[:6], light[6:], batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
@@ -128,8 +131,12 @@ def shade_picture(
     faces = sun_facing(field, field_inputs, views, batch)
     visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
     shown = _dimmed(inputs.sun, colors, visibility, faces)
-    arriving = inputs.sun.left([batch.pad_zeros(light) for light in sunlight.bounced])
-    scattered = _scattered(config, inputs, arriving, sunlight.emitters, batch)
+    bounced, mirrored = [batch.pad_zeros(light) for light in sunlight.bounced], list[Float]()
+    if sunlight.emitters:
+        scatterers = _scatterers(config, inputs)
+        mirrors = _mirroring(scatterers, inputs, batch)
+        mirrored = received(scatterers, sunlight.emitters, config.bounce, batch, mirrors)
+    scattered = _scattered(config, inputs, bounced, mirrored, batch)
     for share in sunlight.mirrored:
         scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
     if scattered:
@@ -146,10 +153,11 @@ def cast_sunlight(
     field_weights, refine_weights = split_weights(config, weights)
     visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
     dr.eval(visibility)
-    bounced, emitters = _bounce(config, field_weights, inputs, visibility, batch)
+    emitters = _emitters(config, field_weights, inputs, visibility, batch)
+    bounced = _received(config, inputs, emitters, batch, mirrors=False)
     dr.eval(bounced)
     shown = batch.unpad([*visibility, *bounced], inputs.means.x)
-    return shown[: len(visibility)], shown[len(visibility) :], emitters
+    return shown[: len(visibility)], shown[len(visibility) :], emitters if config.mirrors else []
 
 
 @recorded
@@ -301,21 +309,37 @@ def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch
     return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 6 if config.mirrors else 3)]
 
 
-def _bounce(
+def _emitters(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, visibility: list[Float], batch: PaddedBatch
-) -> tuple[list[Float], list[Float]]:
-    """(six Floats [M] of `irradiance`, or nothing; the emitters where surfaces mirror them, or nothing). weights: of
-    the field"""
+) -> list[Float]:
+    """What `scattering` gives, or nothing. weights: of the field"""
     if not config.bounce:
-        return [], []
+        return []
     scatterers, count = _scatterers(config, inputs), config.bounce
     chosen = choose(scatterers, visibility, count, batch)
     if config.mirrors:
         light = _painted(config, weights, inputs, visibility, chosen.number, batch.count)
     else:
         light = albedo_radiance(scatterers, visibility, chosen.number, batch.count)
-    emitters = scattering(scatterers, chosen, count, light, batch)
-    return irradiance(scatterers, emitters, count, batch), emitters if config.mirrors else []
+    return scattering(scatterers, chosen, count, light, batch)
+
+
+def _received(
+    config: LightConfig, inputs: ShadingInputs, emitters: list[Float], batch: PaddedBatch, mirrors: bool
+) -> list[Float]:
+    """Six Floats [M], RGB, of `irradiance` and, with `mirrors`, six of `mirroring`; nothing without a bounce."""
+    if not emitters:
+        return []
+    scatterers = _scatterers(config, inputs)
+    kinds = [irradiance(scatterers, batch)]
+    if mirrors:
+        kinds.append(_mirroring(scatterers, inputs, batch))
+    return received(scatterers, emitters, config.bounce, batch, *kinds)
+
+
+def _mirroring(scatterers: Scatterers, inputs: ShadingInputs, batch: PaddedBatch) -> Weights:
+    assert inputs.camera is not None
+    return mirroring(scatterers, inputs.camera.directions_to(batch.repeat_last(inputs.means)), batch)
 
 
 def _painted(
@@ -354,22 +378,20 @@ def _painted(
 
 
 def _scattered(
-    config: LightConfig, inputs: ShadingInputs, bounced: list[Float], emitters: list[Float], batch: PaddedBatch
+    config: LightConfig, inputs: ShadingInputs, bounced: list[Float], mirrored: list[Float], batch: PaddedBatch
 ) -> list[Float]:
     """Three Floats [M]: light of the bounce and the Earth that arrives at the side that is seen, or nothing where there
-    is neither; where surfaces mirror, the six of `mirrored`. bounced: six Floats [M] of `irradiance`, or nothing;
-    emitters: as `_bounce` has them"""
+    is neither; where surfaces mirror, the six of `mirroring`, too. bounced, mirrored: six Floats [M] each, or nothing,
+    before the Earth takes of them"""
     light: list[Float] = []
     field_inputs = _field_inputs(inputs)
+    bounced, mirrored = inputs.sun.left(bounced), inputs.sun.left(mirrored)
     if bounced:
         over = is_back_side_seen(config.field, field_inputs, batch)
         light = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
     for earth in earthlight(config.field, field_inputs, batch):
         light = [channel + config.sunlit_white * earth for channel in light or [ad.Float(0)] * 3]
-    if emitters:
-        direction = field_inputs.camera.directions_to(batch.repeat_last(inputs.means))
-        light += inputs.sun.left(mirrored(_scatterers(config, inputs), emitters, config.bounce, direction, batch))
-    return light
+    return light + mirrored
 
 
 def _reflected(reflectances: list[Float], scattered: list[Float]) -> list[Float]:
