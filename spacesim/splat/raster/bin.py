@@ -37,7 +37,7 @@ TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a trai
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """The tiles of a picture: `columns` x `rows` of one shape."""
 
     columns: int
@@ -45,9 +45,10 @@ class _Grid:
     shape: TileShape
 
     @staticmethod
-    def of(width: int, height: int, shape: TileShape) -> "_Grid":
+    def of(width: int, height: int) -> "Grid":
         """For a picture of width x height pixels."""
-        return _Grid(-(-width // shape.width), -(-height // shape.height), shape)
+        shape = tile_shape()
+        return Grid(-(-width // shape.width), -(-height // shape.height), shape)
 
     @property
     def tiles(self) -> int:
@@ -56,7 +57,7 @@ class _Grid:
 
 
 @dataclass
-class _Boxes:
+class Boxes:
     """Of splats [M]: boxes in tiles, how many tiles, the splats in the order in which pairs are numbered (None: that of
     their indices), and the pairs up to and including each in that order, UInt64."""
 
@@ -66,6 +67,10 @@ class _Boxes:
     count: UInt32
     order: UInt32 | None
     pair_ends: UInt64
+
+    def pairs(self, count: int) -> int:
+        """How many they are, of `count` splats. Waits for the device."""
+        return int(self.pair_ends[round_capacity(count) - 1])
 
 
 MakeLists = Callable[[Splats, Footprints, int, int], TileLists]
@@ -100,13 +105,12 @@ def bin_counted(
     """`bin_splats`, and how many pairs boxes have, which the lists' capacity is enough for."""
     splats = _detached(splats)
     boxes, grid, count = _find_boxes(splats, footprints, width, height)
-    pairs = 0 if boxes is None else int(boxes.pair_ends[round_capacity(count) - 1])
-    check_memory(pairs, width * height, training)
-    if pairs == 0 or boxes is None:
+    pairs = 0 if boxes is None else boxes.pairs(count)
+    capacity = list_capacity(pairs, width * height, few_sizes, training)
+    if capacity == 0 or boxes is None:
         none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape), 0
-    steps = FEW if few_sizes and pairs < LONG else STEPS
-    return _make_lists(splats, footprints, boxes, round_capacity(pairs, steps), grid), pairs
+    return make_lists(splats, footprints, boxes, capacity, round_capacity(count), grid), pairs
 
 
 def bin_async(
@@ -118,22 +122,33 @@ def bin_async(
     boxes, grid, count = _find_boxes(splats, footprints, width, height)
     assert boxes is not None, "lists without splats have no capacity"
     pairs = AsyncNumber(boxes.pair_ends, round_capacity(count) - 1)  # copied before what comes next
-    return _make_lists(splats, footprints, boxes, capacity, grid), pairs
+    return make_lists(splats, footprints, boxes, capacity, round_capacity(count), grid), pairs
 
 
-def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int) -> tuple[_Boxes | None, _Grid, int]:
+def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int) -> tuple[Boxes | None, Grid, int]:
     """(boxes, None of no splats; the image's tiles; how many splats)."""
-    grid, count = _Grid.of(width, height, tile_shape()), dr.width(splats.x)
+    grid, count = Grid.of(width, height), dr.width(splats.x)
     if count == 0:
         return None, grid, 0
-    boxes_of = _boxes if select() == "cuda" else _rank
-    return boxes_of(splats, footprints, dr.opaque(ad.UInt32, count), round_capacity(count), grid), grid, count
+    return make_boxes(splats, footprints, dr.opaque(ad.UInt32, count), round_capacity(count), grid), grid, count
 
 
-def _make_lists(splats: Splats, footprints: Footprints, boxes: _Boxes, capacity: int, grid: _Grid) -> TileLists:
-    """Lists with a capacity for so many pairs."""
+def make_boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
+    """Boxes of `count` splats, [M] = [capacity], `round_capacity` of as many; may be part of a recording."""
+    return (_boxes if select() == "cuda" else _rank)(splats, footprints, count, capacity, grid)
+
+
+def list_capacity(pairs: int, pixels: int, few_sizes: bool, training: bool = False) -> int:
+    """Capacity of lists of so many pairs, 0 of none. Raises WorkError, see `bin_splats`."""
+    check_memory(pairs, pixels, training)
+    return round_capacity(pairs, FEW if few_sizes and pairs < LONG else STEPS) if pairs else 0
+
+
+def make_lists(
+    splats: Splats, footprints: Footprints, boxes: Boxes, capacity: int, splat_capacity: int, grid: Grid
+) -> TileLists:
+    """Lists with a capacity for so many pairs; may be part of a recording. splat_capacity: M of the boxes"""
     lists_of = _count if select() == "cuda" else _expand
-    splat_capacity = round_capacity(dr.width(splats.x))
     return lists_of(splats, footprints, boxes, capacity, splat_capacity, grid)
 
 
@@ -157,16 +172,16 @@ def check_memory(pairs: int, pixels: int, training: bool) -> None:
 
 
 @recorded
-def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid) -> _Boxes:
+def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
     left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, grid)
     wide = ad.UInt64(pairs)
     dr.eval(left, top, columns, pairs, wide)
-    return _Boxes(left, top, columns, pairs, None, _running_sum(wide))
+    return Boxes(left, top, columns, pairs, None, _running_sum(wide))
 
 
 @recorded
-def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid) -> _Boxes:
+def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
     left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, grid)
     # Splats that cannot be seen have no pairs, so their place does not matter.
@@ -174,11 +189,11 @@ def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, 
     key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
     dr.eval(left, top, columns, pairs, key)
     order = _stable_order(key, 32)
-    return _Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
+    return Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
 
 
 def _boxes_in_tiles(
-    splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: _Grid
+    splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid
 ) -> tuple[UInt32, UInt32, UInt32, UInt32, Bool]:
     """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
     index = dr.arange(ad.UInt32, capacity)
@@ -200,10 +215,10 @@ def _running_sum(values: UInt64) -> UInt64:
 def _count(
     splats: Splats,
     footprints: Footprints,
-    boxes: _Boxes,
+    boxes: Boxes,
     capacity: int,
     splat_capacity: int,
-    grid: _Grid,
+    grid: Grid,
 ) -> TileLists:
     """Lists that are ordered one by one."""
     slot = dr.arange(ad.UInt32, capacity)
@@ -225,10 +240,10 @@ def _count(
 def _expand(
     splats: Splats,
     _footprints: Footprints,
-    boxes: _Boxes,
+    boxes: Boxes,
     capacity: int,
     splat_capacity: int,
-    grid: _Grid,
+    grid: Grid,
 ) -> TileLists:
     """Lists from two stable sorts."""
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
@@ -264,7 +279,7 @@ def _expand(
     )
 
 
-def _pairs_that_fit(boxes: _Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
+def _pairs_that_fit(boxes: Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
     """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not."""
     pairs = dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
     fits = pairs <= capacity
@@ -297,7 +312,7 @@ def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
     return dr.gather(ad.UInt32, sorted_, dr.select(is_dealt, (turn * shares + share) * group + within, index))
 
 
-def _tile_of(splats: Splats, boxes: _Boxes, splat: UInt32, within: UInt32, exists: Bool, grid: _Grid) -> UInt32:
+def _tile_of(splats: Splats, boxes: Boxes, splat: UInt32, within: UInt32, exists: Bool, grid: Grid) -> UInt32:
     """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
     misses the tile."""
     columns = dr.maximum(dr.gather(ad.UInt32, boxes.columns, splat), 1)

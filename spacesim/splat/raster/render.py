@@ -9,16 +9,16 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float
+from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32
 from spacesim.data.structure import checked
-from spacesim.splat.raster.bin import bin_splats
-from spacesim.splat.raster.blend import rasterize
+from spacesim.splat.raster.bin import Boxes, Grid, bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.blend import blend_lists, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals, unit
-from spacesim.splat.raster.tiles import TileLists
+from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
 
@@ -60,25 +60,102 @@ def render(
         return _empty_output(camera, outputs, None if features is None else len(feature_list))
 
     rows = gaussians.rows()
-    splats, footprints, groups = prepare(rows, camera, sh_degree, tuple(outputs), antialiased)
-    if features is not None:
-        groups["features"] = _clean_features(feature_list, gaussians.count)
-
-    blended = blend(splats, footprints, [f for group in groups.values() for f in group], camera)
-    planes, drawn = iter(blended.planes), dict[str, list[Float]]()
-    for name, group in groups.items():
-        drawn[name] = [next(planes) for _ in group]
-    alpha, depth, normal = _finish(blended.transmittance, drawn.get("depth", []), drawn.get("normal", []))
+    more = {} if features is None else {"features": _clean_features(feature_list, gaussians.count)}
+    draw = _draw_differentiably if dr.grad_enabled(rows, camera.values, feature_list) else _draw
+    splats, lists, planes = draw(rows, camera, sh_degree, tuple(outputs), antialiased, more)
     return RenderOutput(
-        color=ad.Array3f(drawn["color"]) if "color" in drawn else None,
-        alpha=alpha,
-        depth=depth,
+        color=ad.Array3f(planes["color"]) if "color" in planes else None,
+        alpha=planes["alpha"][0],
+        depth=planes["depth"][0] if "depth" in planes else None,
         width=camera.width,
         height=camera.height,
-        median_depth=median_depth(splats, blended.lists, camera) if "median_depth" in outputs else None,
-        normal=normal,
-        features=drawn.get("features"),
+        median_depth=None if lists is None else median_depth(splats, lists, camera),
+        normal=ad.Array3f(planes["normal"]) if "normal" in planes else None,
+        features=planes.get("features"),
     )
+
+
+Planes = dict[str, list[Float]]
+"""Planes of a picture, or what is blended to them, Floats [N], by the name of an output."""
+
+
+def _draw_differentiably(
+    rows: list[Float],
+    camera: Projection,
+    sh_degree: int | None,
+    outputs: tuple[str, ...],
+    antialiased: Bool | bool,
+    more: Planes,
+) -> tuple[Splats, TileLists | None, Planes]:
+    """(splats; the tiles' lists, if the median depth is wanted; planes). more: to be blended beside the outputs"""
+    splats, footprints, groups = prepare(rows, camera, sh_degree, outputs, antialiased)
+    groups |= more
+    blended = blend(splats, footprints, [f for group in groups.values() for f in group], camera)
+    lists = blended.lists if "median_depth" in outputs else None
+    return splats, lists, _finish(blended.planes, blended.transmittance, {k: len(v) for k, v in groups.items()})
+
+
+def _draw(
+    rows: list[Float],
+    camera: Projection,
+    sh_degree: int | None,
+    outputs: tuple[str, ...],
+    antialiased: Bool | bool,
+    more: Planes,
+) -> tuple[Splats, TileLists | None, Planes]:
+    """The same without gradients, in two recordings, between which the host waits for the number of pairs."""
+    count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
+    live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
+    splats, footprints, groups, boxes = _prepare_boxes(rows, camera, sh_degree, outputs, antialiased, live, most, grid)
+    capacity = list_capacity(boxes.pairs(count), size[0] * size[1], few_sizes=True)
+    if capacity == 0:
+        return _draw_differentiably(rows, camera, sh_degree, outputs, antialiased, more)
+    keeps = "median_depth" in outputs
+    lists, planes = _draw_boxes(splats, footprints, boxes, groups | more, size, capacity, most, grid, keeps)
+    return splats, lists, planes
+
+
+@recorded
+def _prepare_boxes(
+    rows: list[Float],
+    camera: Projection,
+    sh_degree: int | None,
+    outputs: tuple[str, ...],
+    antialiased: Bool | bool,
+    count: UInt32,
+    capacity: int,
+    grid: Grid,
+) -> tuple[Splats, Footprints, Planes, Boxes]:
+    """`prepare`, and the boxes of the `count` splats [capacity]."""
+    splats, footprints, groups = prepare(rows, camera, sh_degree, outputs, antialiased)
+    dr.eval(splats, footprints, groups)
+    return splats, footprints, groups, make_boxes(splats, footprints, count, capacity, grid)
+
+
+@recorded(elements=lambda _, splats, footprints, boxes, groups, size, *_rest: size[0] * size[1])
+def _draw_boxes(
+    splats: Splats,
+    footprints: Footprints,
+    boxes: Boxes,
+    groups: Planes,
+    size: tuple[int, int],
+    capacity: int,
+    splat_capacity: int,
+    grid: Grid,
+    keeps_lists: bool,
+) -> tuple[TileLists | None, Planes]:
+    """(the lists, of `capacity`, if they are wanted; planes)."""
+    lists = make_lists(splats, footprints, boxes, capacity, splat_capacity, grid)
+    passes = _passes([feature for group in groups.values() for feature in group])
+    blended = [blend_lists(splats, group, lists, *size, splat_capacity) for group in passes]
+    planes = [plane for one in blended for plane in one.features]
+    finished = _finish(planes, blended[0].transmittance, {name: len(group) for name, group in groups.items()})
+    return lists if keeps_lists else None, finished
+
+
+def _passes(features: list[Float]) -> list[list[Float]]:
+    """Features that are blended at once, `FEATURES_PER_PASS` at most; one pass of none."""
+    return [features[i : i + FEATURES_PER_PASS] for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
 
 
 @recorded
@@ -110,14 +187,16 @@ def _clean(features: list[Float]) -> list[Float]:
     return [_finite(feature) for feature in features]
 
 
-@recorded
-def _finish(
-    transmittance: Float, depth: list[Float], normal: list[Float]
-) -> tuple[Float, Float | None, Array3f | None]:
-    """(alpha, expected depth, unit normals) of blended planes, None for those that were not blended."""
-    alpha = 1 - transmittance
-    expected = over_alpha(depth[0], alpha) if depth else None
-    return alpha, expected, unit(ad.Array3f(normal)) if normal else None
+def _finish(planes: list[Float], transmittance: Float, counts: dict[str, int]) -> Planes:
+    """Blended planes, so many by each name, with "alpha", expected depth and unit normals."""
+    rest = iter(planes)
+    finished = {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
+    finished["alpha"] = [1 - transmittance]
+    if "depth" in finished:
+        finished["depth"] = [over_alpha(finished["depth"][0], finished["alpha"][0])]
+    if "normal" in finished:
+        finished["normal"] = list(unit(ad.Array3f(finished["normal"])))
+    return finished
 
 
 @dataclass
@@ -132,10 +211,9 @@ class BlendedPlanes:
 def blend(splats: Splats, footprints: Footprints, features: Sequence[Float], camera: Projection) -> BlendedPlanes:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
     lists = bin_splats(splats, footprints, camera.width, camera.height, few_sizes=True)
-    passes = [list(features[i : i + FEATURES_PER_PASS]) for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
     planes: list[Float] = []
     passed: list[Float] = []
-    for group in passes:
+    for group in _passes(list(features)):
         group_planes, transmittance = rasterize(splats, group, lists, camera.width, camera.height)
         planes += group_planes
         passed.append(transmittance)

@@ -15,6 +15,7 @@ from spacesim.data.records import Camera
 from spacesim.splat.raster import bin as binning
 from spacesim.splat.raster import blend as rasterize
 from spacesim.splat.raster import records, tiles
+from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.render import render
@@ -390,13 +391,22 @@ def test_absolute_sums_change_no_gradient(monkeypatch):
 
 
 def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
-    kept = []
-    plain = rasterize.forward
-    monkeypatch.setattr(rasterize, "forward", lambda *a, **k: kept.append(k.get("adjoint", False)) or plain(*a, **k))
+    buckets = []
+    plain = rasterize.blend_lists
+
+    def spied(*arguments):
+        buckets.append(arguments[6] if len(arguments) > 6 else None)
+        return plain(*arguments)
+
+    for module in (rasterize, rendering):
+        monkeypatch.setattr(module, "blend_lists", spied)
+    monkeypatch.setattr(rendering, "_draw_boxes", rendering._draw_boxes.traced)
     arrays, view = random_splats(30), camera()
     picture(arrays, view)
     gradients(arrays, view)
-    assert kept == [False, True]
+    assert len(buckets) == 2
+    assert buckets[0] is None
+    assert buckets[1] is not None
 
 
 SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1), (16, 8, 4, 8), (4, 16, 4, 1)]
