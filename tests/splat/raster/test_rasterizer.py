@@ -470,3 +470,21 @@ def test_the_number_of_threads_does_not_show():
     for other in found[1:]:
         for name in NAMES:
             np.testing.assert_array_equal(found[0][name], other[name])
+
+
+@pytest.mark.parametrize("lists", ["own", "cuda"])
+def test_frames_are_drawn_as_pictures_with_gradients_are(lists, monkeypatch):
+    """Recorded for some Gaussians, replayed for others; by the lists of this backend and, on any, by CUDA's."""
+    if lists == "cuda":
+        for module in (binning, tiles, rasterize):
+            monkeypatch.setattr(module, "select", lambda: "cuda")
+    outputs = ("color", "depth", "median_depth", "normal")
+    for count in (300, 290, 1500, 1400):
+        gaussians, camera_ = Gaussians.from_numpy(random_splats(count, seed=count)), Pinhole.of(camera())
+        features = [upload(np.arange(count, dtype=np.float32) * k) for k in range(rendering.FEATURES_PER_PASS + 2)]
+        with monkeypatch.context() as patch:
+            frame = render(gaussians, camera_, outputs=outputs, features=features)
+            patch.setattr(rendering, "_draw", rendering._draw_differentiably)
+            twin = render(gaussians, camera_, outputs=outputs, features=features)
+        for name in ("color", "alpha", "depth", "median_depth", "normal", "features"):
+            np.testing.assert_array_equal(np.array(getattr(frame, name)), np.array(getattr(twin, name)), name)
