@@ -38,11 +38,11 @@ TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a trai
 
 @dataclass(frozen=True)
 class Grid:
-    """The tiles of a picture: `columns` x `rows` of one shape."""
+    """The tiles of a picture, all of one shape."""
 
-    columns: int
-    rows: int
-    shape: TileShape
+    columns: int  #: tiles in a row
+    rows: int  #: rows of tiles
+    shape: TileShape  #: of each
 
     @staticmethod
     def of(width: int, height: int) -> "Grid":
@@ -58,15 +58,14 @@ class Grid:
 
 @dataclass
 class Boxes:
-    """Of splats [M]: boxes in tiles, how many tiles, the splats in the order in which pairs are numbered (None: that of
-    their indices), and the pairs up to and including each in that order, UInt64."""
+    """Of splats [M]: the tiles that the box around each reaches."""
 
-    left: UInt32
-    top: UInt32
-    columns: UInt32
-    count: UInt32
-    order: UInt32 | None
-    pair_ends: UInt64
+    left: UInt32  #: column of the first
+    top: UInt32  #: row of the first
+    columns: UInt32  #: in a row
+    count: UInt32  #: of all, 0 for what cannot be seen
+    order: UInt32 | None  #: the splats in the order in which pairs are numbered, None: that of their indices
+    pair_ends: UInt64  #: pairs up to and including each splat, in that order
 
     def pairs(self, count: int) -> int:
         """How many they are, of `count` splats. Waits for the device."""
