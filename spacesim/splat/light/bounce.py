@@ -26,6 +26,7 @@ ROUGHNESS = 0.15  #: GGX alpha at which surfaces mirror what others scatter (doc
 OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap, albedos learn the rest
 GLASS = 0.04  #: specular reflectance of a glossy surface of refractive index 1.5
 EMITTER = 10  #: numbers of an emitter: place, normal, area, light
+WIDE = 0.1  #: of the training frame's unit: what is wider is no likelier to be chosen as an emitter
 MAX_EMITTER_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
 
 
@@ -42,6 +43,7 @@ class Scatterers:
     log_scales: Array3f  #: Array3f [3, N]
     logit_opacities: Float  #: [N]
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
+    unit: Float  #: of width 1, metres, of the training frame
 
 
 Weights = Callable[[Array3f, Float], list[Float]]
@@ -135,7 +137,7 @@ def choose(scatterers: Scatterers, visibility: list[Float], count: int, batch: P
     visibility: v [M] in a list, or nothing for 1"""
     lit = dr.abs(dr.dot(_normals(scatterers, batch), scatterers.sun))
     areas = _areas(batch.repeat_last(scatterers.log_scales), batch.repeat_last(scatterers.logit_opacities))
-    caught = lit * dr.minimum(areas, MAX_EMITTER_AREA)
+    caught = lit * dr.minimum(areas, dr.square(WIDE * scatterers.unit))  # one that is vast would be all of them
     for share in visibility:
         caught *= share
     column = dr.arange(ad.UInt32, batch.capacity)

@@ -301,6 +301,7 @@ def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
         log_scales=inputs.rotations_and_scales[1],
         logit_opacities=inputs.logits,
         sun=towards_sun(inputs.sun.light_axes),
+        unit=dr.gather(ad.Float, inputs.training_frame, ad.UInt32(3)),
     )
 
 

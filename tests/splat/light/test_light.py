@@ -184,7 +184,7 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> n
     albedo, found = sigmoid(features[:, config.albedos : config.albedos + 3]), np.zeros((3, count, 3))
     areas = 0.6 * np.pi * np.sort(np.exp(arrays["log_scales"]), axis=1)[:, 1:].prod(axis=1)
     areas *= sigmoid(arrays["logit_opacities"])
-    caught = areas * visibility * np.abs(normals @ SUN)
+    caught = np.minimum(areas, (0.1 * light.frame.scale) ** 2) * visibility * np.abs(normals @ SUN)
     for number in range(config.bounce):
         k = np.searchsorted(np.cumsum(caught), (number + 0.5) / config.bounce * caught.sum())
         lit = normals[k] * np.sign(normals[k] @ SUN)
