@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32, UInt64
 from spacesim.learning.mlp import sigmoid
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
@@ -26,7 +26,8 @@ ROUGHNESS = 0.15  #: GGX alpha at which surfaces mirror what others scatter (doc
 OVERLAP = 0.3  #: share of the Gaussians' areas that is surface: they overlap, albedos learn the rest
 GLASS = 0.04  #: specular reflectance of a glossy surface of refractive index 1.5
 EMITTER = 10  #: numbers of an emitter: place, normal, area, light
-WIDE = 0.1  #: of the training frame's unit: what is wider is no likelier to be chosen as an emitter
+WIDE = 0.1  #: of the training frame's unit, squared: what has more area is no likelier to be chosen as an emitter
+LEAST_COSINE = 0.3  #: a glossy surface at a grazing Sun is brighter than its cosine says: it counts as much at least
 MAX_EMITTER_AREA = 1e12  #: bound on an emitter's area, m^2: products stay finite in float32
 
 
@@ -61,7 +62,7 @@ def received(
     means = batch.repeat_last(scatterers.means)
 
     def has_more(k: UInt32, _sums: list[Float]) -> Bool:
-        return k < count
+        return k < dr.minimum(batch.count, count)
 
     def add(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
         towards, share, light = _seen_emitter(emitters, k, count, means)
@@ -127,33 +128,39 @@ def grazing_reflectance_slope(specular: Float) -> Float:
 class Chosen:
     """Gaussians that scatter in place of all, [count] each."""
 
-    number: UInt32  #: which, one maybe more than once
+    number: UInt32  #: which
     share: Float  #: of how many such as it is each stands for
 
 
 def choose(scatterers: Scatterers, visibility: list[Float], count: int, batch: PaddedBatch) -> Chosen:
-    """`count` of the N Gaussians, at even steps of the running sum of the sunlight that they catch, area v |n . s|
-    (systematic sampling), in whole numbers, so that the bits repeat; all, once each, where they are no more than that.
+    """One of each of `count` even blocks of the N Gaussians: that at the middle of the block's running sum of the
+    sunlight that they catch, area v max(|n . s|, `LEAST_COSINE`), in whole numbers, so that the bits repeat; all, once
+    each, where they are no more than `count`. In blocks, since a Sun that turns a little then changes few of them.
     visibility: v [M] in a list, or nothing for 1"""
-    lit = dr.abs(dr.dot(_normals(scatterers, batch), scatterers.sun))
+    cosine: Float = dr.abs(dr.dot(_normals(scatterers, batch), scatterers.sun))
     areas = _areas(batch.repeat_last(scatterers.log_scales), batch.repeat_last(scatterers.logit_opacities))
-    caught = lit * dr.minimum(areas, dr.square(WIDE * scatterers.unit))  # one that is vast would be all of them
+    caught = dr.maximum(cosine, LEAST_COSINE) * dr.minimum(areas, dr.square(WIDE * scatterers.unit))
     for share in visibility:
         caught *= share
     column = dr.arange(ad.UInt32, batch.capacity)
     caught = dr.select((column < batch.count) & (caught > 0), caught, 0)  # what is no number is not above 0
     dr.eval(caught)
     most = dr.max(caught)
-    weights = ad.UInt64(caught * (2.0**24 / dr.maximum(most, 1e-30)))
+    weights: UInt64 = ad.UInt64(caught * (2.0**24 / dr.maximum(most, 1e-30)))
     dr.eval(weights)
-    ends = dr.prefix_reduce(dr.ReduceOp.Add, weights, exclusive=False)
+    ends: UInt64 = dr.prefix_reduce(dr.ReduceOp.Add, weights, exclusive=False)
     dr.eval(ends)
+
     index, last = dr.arange(ad.UInt32, count), batch.count - 1
-    total = dr.gather(ad.UInt64, ends, last)
-    place = total * (2 * ad.UInt64(index) + 1) // (2 * count)
-    number = dr.minimum(segment_ids(ends, place, batch.capacity), last)
+
+    def sum_before(block: UInt32) -> UInt64:
+        first = ad.UInt32(ad.UInt64(block) * ad.UInt64(batch.count) // count)
+        return dr.gather(ad.UInt64, ends, first - 1, first > 0)
+
+    before, beyond = sum_before(index), sum_before(index + 1)
+    number = dr.minimum(segment_ids(ends, (before + beyond) // 2, batch.capacity), last)
     weight = ad.Float(dr.gather(ad.UInt64, weights, number))
-    share = dr.select(weight > 0, ad.Float(total) / (count * dr.maximum(weight, 1)), 0)
+    share = dr.select(beyond > before, ad.Float(beyond - before) / dr.maximum(weight, 1), 0)
     are_few = batch.count <= count
     number = dr.select(are_few, dr.minimum(index, last), number)
     share = dr.select(are_few, dr.select(index <= last, ad.Float(1), 0), share)
@@ -175,7 +182,8 @@ def scattering(
     index, k = dr.arange(ad.UInt32, count), chosen.number
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
     normal = lit_normals(scatterers, k, batch.count)
-    area = chosen.share * _areas(log_scales, dr.gather(ad.Float, scatterers.logit_opacities, k))
+    area = dr.maximum(chosen.share, 1) * _areas(log_scales, dr.gather(ad.Float, scatterers.logit_opacities, k))
+    light = [value * dr.minimum(chosen.share, 1) for value in light]  # discs in one place would add up beyond one
     numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *light]
     sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     packed = [store(values, index, count) for values in packets([dr.select(sound, number, 0) for number in numbers])]

@@ -30,8 +30,8 @@ MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a
 FEW = 2  #: sizes of the lists of pictures from one power of two to the next
 LONG = 2**22  #: pairs from which on lists of pictures have no more capacity than others: a gigabyte
 MAX_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
-PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour, transmittance and what blending keeps of
-#: them): measured on LLVM, 90 to 210 a pair, as the rounding of arrays has it
+PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour and transmittance): measured on LLVM, 90
+#: to 210 a pair, as the rounding of arrays has it
 TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
 #: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
 

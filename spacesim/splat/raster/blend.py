@@ -30,7 +30,7 @@ from spacesim.splat.raster.records import (
 )
 from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 
-BUCKET = 8  #: pairs of a bucket, a power of two; 4 keep twice as much for 1 % of a step, 16 took longer on an H100
+BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
 CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
 
@@ -40,7 +40,7 @@ def forward(
 ) -> BlendResult:
     """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs.
 
-    adjoint: keep what the backend's fastest `backward` reads; it costs memory, and can do without.
+    adjoint: keep what `backward` reads; it costs memory
     """
     bucket = _bucket(lists, len(features)) if adjoint else None
     return blend_lists(splats, features, lists, width, height, round_capacity(dr.width(splats.x)), bucket)
@@ -68,6 +68,7 @@ def blend_lists(
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = TURN[select()]
+    assert not bucket or bucket % turn == 0, "a bucket is some turns of the loop"
     records = list_records(splats, features, lists, capacity)
     thread = thread_pixels(lists)
     start = dr.gather(ad.UInt32, lists.start, thread.tile)

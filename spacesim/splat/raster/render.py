@@ -20,6 +20,7 @@ from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals, unit
 from spacesim.splat.raster.tiles import TileLists, round_capacity
 
+PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
 
 
@@ -61,7 +62,9 @@ def render(
 
     rows = gaussians.rows()
     more = {} if features is None else {"features": _clean_features(feature_list, gaussians.count)}
-    draw = _draw_differentiably if dr.grad_enabled(rows, camera.values, feature_list) else _draw
+    blended = sum(PLANES.get(name, 0) for name in outputs) + len(feature_list)
+    in_stages = blended > FEATURES_PER_PASS or dr.grad_enabled(rows, camera.values, feature_list)
+    draw = _draw_in_stages if in_stages else _draw
     splats, lists, planes = draw(rows, camera, sh_degree, tuple(outputs), antialiased, more)
     return RenderOutput(
         color=ad.Array3f(planes["color"]) if "color" in planes else None,
@@ -79,7 +82,7 @@ Planes = dict[str, list[Float]]
 """Planes of a picture, or what is blended to them, Floats [N], by the name of an output."""
 
 
-def _draw_differentiably(
+def _draw_in_stages(
     rows: list[Float],
     camera: Projection,
     sh_degree: int | None,
@@ -103,13 +106,14 @@ def _draw(
     antialiased: Bool | bool,
     more: Planes,
 ) -> tuple[Splats, TileLists | None, Planes]:
-    """The same without gradients, in two recordings, between which the host waits for the number of pairs."""
+    """The same without gradients and in one pass: two recordings, between which the host waits for the number of
+    pairs. More passes in one recording would hold the memory of all of them."""
     count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
     live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
     splats, footprints, groups, boxes = _prepare_boxes(rows, camera, sh_degree, outputs, antialiased, live, most, grid)
     capacity = list_capacity(boxes.pairs(count), size[0] * size[1], few_sizes=True)
     if capacity == 0:
-        return _draw_differentiably(rows, camera, sh_degree, outputs, antialiased, more)
+        return _draw_in_stages(rows, camera, sh_degree, outputs, antialiased, more)
     keeps = "median_depth" in outputs
     lists, planes = _draw_boxes(splats, footprints, boxes, groups | more, size, capacity, most, grid, keeps)
     return splats, lists, planes
@@ -146,16 +150,10 @@ def _draw_boxes(
 ) -> tuple[TileLists | None, Planes]:
     """(the lists, of `capacity`, if they are wanted; planes)."""
     lists = make_lists(splats, footprints, boxes, capacity, splat_capacity, grid)
-    passes = _passes([feature for group in groups.values() for feature in group])
-    blended = [blend_lists(splats, group, lists, *size, splat_capacity) for group in passes]
-    planes = [plane for one in blended for plane in one.features]
-    finished = _finish(planes, blended[0].transmittance, {name: len(group) for name, group in groups.items()})
-    return lists if keeps_lists else None, finished
-
-
-def _passes(features: list[Float]) -> list[list[Float]]:
-    """Features that are blended at once, `FEATURES_PER_PASS` at most; one pass of none."""
-    return [features[i : i + FEATURES_PER_PASS] for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
+    features = [feature for group in groups.values() for feature in group]
+    blended = blend_lists(splats, features, lists, *size, splat_capacity)
+    counts = {name: len(group) for name, group in groups.items()}
+    return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, counts)
 
 
 @recorded
@@ -213,7 +211,8 @@ def blend(splats: Splats, footprints: Footprints, features: Sequence[Float], cam
     lists = bin_splats(splats, footprints, camera.width, camera.height, few_sizes=True)
     planes: list[Float] = []
     passed: list[Float] = []
-    for group in _passes(list(features)):
+    passes = [list(features[i : i + FEATURES_PER_PASS]) for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
+    for group in passes:
         group_planes, transmittance = rasterize(splats, group, lists, camera.width, camera.height)
         planes += group_planes
         passed.append(transmittance)

@@ -311,16 +311,47 @@ def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_p
     assert (lit.rgb - black.rgb).max() > 1e-3
 
 
-def test_one_that_is_not_a_number_lights_nobody():
+@pytest.mark.parametrize("emitters", [2000, 1600, 400])
+def test_one_that_is_not_a_number_lights_nobody(emitters):
     """A receiver over a wall, some of which is broken: as bright as before, less these."""
     splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
-    light, up = model(replace(GLOW, bounce=splats.count)), np.array([0.0, 0, 1])
+    light, up = model(replace(GLOW, bounce=emitters)), np.array([0.0, 0, 1])
     before = numbers(light.sunlight(splats, up).bounced[0])[-1]
     for name, value in (("logit_opacities", np.nan), ("log_scales", np.nan), ("log_scales", np.inf), ("means", np.inf)):
         arrays = splats.to_numpy()
         arrays[name][800] = value
         found = numbers(light.sunlight(Gaussians.from_numpy(arrays), up).bounced[0])[-1]
         assert found == pytest.approx(before, rel=0.01), name
+
+
+@pytest.mark.parametrize("emitters", [100, 400])
+def test_a_vast_one_is_not_all_emitters(emitters):
+    """It lights as one vast disc does, if it is chosen, and the rest of the wall as before."""
+    splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
+    arrays, up = splats.to_numpy(), np.array([0.0, 0, 1])
+    for size in (8, 15):
+        arrays["log_scales"][800, :2] = size
+        vast = Gaussians.from_numpy(arrays)
+        every, some = (
+            numbers(model(replace(GLOW, bounce=count)).sunlight(vast, up).bounced[0])[-1]
+            for count in (splats.count, emitters)
+        )
+        assert some == pytest.approx(every, rel=0.3), size
+
+
+def test_emitters_stay_as_the_sun_turns():
+    """By a tenth of a degree: the light changes by as little as that of all would, not by other emitters."""
+    rng = np.random.default_rng(3)
+    places, albedo = 2 * rng.uniform(size=(900, 3)) - 1, 0.5
+    turns = rng.normal(size=(900, 3))
+    cloud = Gaussians.from_numpy(discs(places, turns / np.linalg.norm(turns, axis=1, keepdims=True), 0.1, albedo))
+    light = model(replace(GLOW, bounce=200))
+    rows = []
+    for angle in (0.7, 0.7 + np.radians(0.1)):
+        sun = np.array([np.sin(angle), 0.1, np.cos(angle)])
+        rows.append(np.array([numbers(row) for row in light.sunlight(cloud, sun / np.linalg.norm(sun)).bounced]))
+    change = np.sqrt(((rows[1] - rows[0]) ** 2).mean() / (rows[0] ** 2).mean())
+    assert change < 0.1, "the running sum of all would change by more than half"
 
 
 @pytest.mark.parametrize("name", PRESETS)

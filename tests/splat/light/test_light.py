@@ -184,11 +184,14 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> n
     albedo, found = sigmoid(features[:, config.albedos : config.albedos + 3]), np.zeros((3, count, 3))
     areas = 0.6 * np.pi * np.sort(np.exp(arrays["log_scales"]), axis=1)[:, 1:].prod(axis=1)
     areas *= sigmoid(arrays["logit_opacities"])
-    caught = np.minimum(areas, (0.1 * light.frame.scale) ** 2) * visibility * np.abs(normals @ SUN)
+    caught = np.minimum(areas, (0.1 * light.frame.scale) ** 2) * visibility
+    caught = caught * np.maximum(np.abs(normals @ SUN), 0.3)
     for number in range(config.bounce):
-        k = np.searchsorted(np.cumsum(caught), (number + 0.5) / config.bounce * caught.sum())
+        block = slice(number * count // config.bounce, (number + 1) * count // config.bounce)
+        k = block.start + np.searchsorted(np.cumsum(caught[block]), 0.5 * caught[block].sum())
+        share = caught[block].sum() / caught[k]
         lit = normals[k] * np.sign(normals[k] @ SUN)
-        area = areas[k] * caught.sum() / (config.bounce * caught[k])
+        area = areas[k] * max(share, 1)
         emitted = albedo[k] * visibility[k] * (lit @ SUN)
         if config.gloss:
             colors = visibility[k] * paint(np.full(4, k), four_sides(lit))

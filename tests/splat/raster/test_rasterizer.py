@@ -481,10 +481,10 @@ def test_frames_are_drawn_as_pictures_with_gradients_are(lists, monkeypatch):
     outputs = ("color", "depth", "median_depth", "normal")
     for count in (300, 290, 1500, 1400):
         gaussians, camera_ = Gaussians.from_numpy(random_splats(count, seed=count)), Pinhole.of(camera())
-        features = [upload(np.arange(count, dtype=np.float32) * k) for k in range(rendering.FEATURES_PER_PASS + 2)]
+        features = [upload(np.arange(count, dtype=np.float32) * k) for k in range(3)]
         with monkeypatch.context() as patch:
             frame = render(gaussians, camera_, outputs=outputs, features=features)
-            patch.setattr(rendering, "_draw", rendering._draw_differentiably)
+            patch.setattr(rendering, "_draw", rendering._draw_in_stages)
             twin = render(gaussians, camera_, outputs=outputs, features=features)
         for name in ("color", "alpha", "depth", "median_depth", "normal", "features"):
             np.testing.assert_array_equal(np.array(getattr(frame, name)), np.array(getattr(twin, name)), name)
