@@ -177,13 +177,13 @@ def _areas(log_scales: Array3f, logit_opacities: Float) -> Float:
 def scattering(
     scatterers: Scatterers, chosen: Chosen, count: int, light: list[Float], batch: PaddedBatch
 ) -> list[Float]:
-    """Emitters as `received` reads them: `count` `chosen` Gaussians, each as large as what it stands
-    for. light: that they scatter, RGB, Floats [count]"""
+    """Emitters as `received` reads them: `count` `chosen` Gaussians, as large as what each stands for; one that stands
+    for less than itself is as large as it is, and darker. light: that they scatter, RGB, Floats [count]"""
     index, k = dr.arange(ad.UInt32, count), chosen.number
     place, log_scales = (dr.gather(ad.Array3f, of, k) for of in (scatterers.means, scatterers.log_scales))
     normal = lit_normals(scatterers, k, batch.count)
     area = dr.maximum(chosen.share, 1) * _areas(log_scales, dr.gather(ad.Float, scatterers.logit_opacities, k))
-    light = [value * dr.minimum(chosen.share, 1) for value in light]  # discs in one place would add up beyond one
+    light = [value * dr.minimum(chosen.share, 1) for value in light]
     numbers = [*place, *normal, dr.minimum(area, MAX_EMITTER_AREA), *light]
     sound = dr.isfinite(sum(numbers, ad.Float(0))) & ~dr.isnan(area)  # one that is not would reach all others
     packed = [store(values, index, count) for values in packets([dr.select(sound, number, 0) for number in numbers])]

@@ -15,7 +15,6 @@ from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import (
     Scatterers,
-    Weights,
     add_irradiance,
     add_irradiance_slopes,
     albedo_radiance,
@@ -98,7 +97,7 @@ def shade(
     outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
     emitters = _emitters(config, field_weights, inputs, [1 - value for value in occlusion], batch)
-    light = _received(config, inputs, emitters, batch, config.mirrors)
+    light = _received(config, inputs, emitters, batch, sides=True, mirrors=config.mirrors)
     scattered = _scattered(config, inputs, light[:6], light[6:], batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
@@ -131,11 +130,8 @@ def shade_picture(
     faces = sun_facing(field, field_inputs, views, batch)
     visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
     shown = _dimmed(inputs.sun, colors, visibility, faces)
-    bounced, mirrored = [batch.pad_zeros(light) for light in sunlight.bounced], list[Float]()
-    if sunlight.emitters:
-        scatterers = _scatterers(config, inputs)
-        mirrors = _mirroring(scatterers, inputs, batch)
-        mirrored = received(scatterers, sunlight.emitters, config.bounce, batch, mirrors)
+    bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
+    mirrored = _received(config, inputs, sunlight.emitters, batch, sides=False, mirrors=True)
     scattered = _scattered(config, inputs, bounced, mirrored, batch)
     for share in sunlight.mirrored:
         scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
@@ -154,7 +150,7 @@ def cast_sunlight(
     visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
     dr.eval(visibility)
     emitters = _emitters(config, field_weights, inputs, visibility, batch)
-    bounced = _received(config, inputs, emitters, batch, mirrors=False)
+    bounced = _received(config, inputs, emitters, batch, sides=True, mirrors=False)
     dr.eval(bounced)
     shown = batch.unpad([*visibility, *bounced], inputs.means.x)
     return shown[: len(visibility)], shown[len(visibility) :], emitters if config.mirrors else []
@@ -326,21 +322,19 @@ def _emitters(
 
 
 def _received(
-    config: LightConfig, inputs: ShadingInputs, emitters: list[Float], batch: PaddedBatch, mirrors: bool
+    config: LightConfig, inputs: ShadingInputs, emitters: list[Float], batch: PaddedBatch, sides: bool, mirrors: bool
 ) -> list[Float]:
-    """Six Floats [M], RGB, of `irradiance` and, with `mirrors`, six of `mirroring`; nothing without a bounce."""
+    """Six Floats [M], RGB, of `irradiance` with `sides`, then six of `mirroring` with `mirrors`; nothing without
+    emitters."""
     if not emitters:
         return []
     scatterers = _scatterers(config, inputs)
-    kinds = [irradiance(scatterers, batch)]
+    kinds = [irradiance(scatterers, batch)] if sides else []
     if mirrors:
-        kinds.append(_mirroring(scatterers, inputs, batch))
+        assert inputs.camera is not None
+        direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+        kinds.append(mirroring(scatterers, direction, batch))
     return received(scatterers, emitters, config.bounce, batch, *kinds)
-
-
-def _mirroring(scatterers: Scatterers, inputs: ShadingInputs, batch: PaddedBatch) -> Weights:
-    assert inputs.camera is not None
-    return mirroring(scatterers, inputs.camera.directions_to(batch.repeat_last(inputs.means)), batch)
 
 
 def _painted(

@@ -60,19 +60,21 @@ def render(
     if gaussians.count == 0:
         return _empty_output(camera, outputs, None if features is None else len(feature_list))
 
-    rows = gaussians.rows()
+    inputs = gaussians.rows(), camera, sh_degree, tuple(outputs), antialiased  # of `prepare`
     more = {} if features is None else {"features": _clean_features(feature_list, gaussians.count)}
     blended = sum(PLANES.get(name, 0) for name in outputs) + len(feature_list)
-    in_stages = blended > FEATURES_PER_PASS or dr.grad_enabled(rows, camera.values, feature_list)
-    draw = _draw_in_stages if in_stages else _draw
-    splats, lists, planes = draw(rows, camera, sh_degree, tuple(outputs), antialiased, more)
+    if blended > FEATURES_PER_PASS or dr.grad_enabled(inputs[0], camera.values, feature_list):
+        splats, footprints, groups = prepare(*inputs)
+        lists, planes = _draw_in_stages(splats, footprints, groups | more, camera)
+    else:
+        splats, lists, planes = _draw(inputs, more, "median_depth" in outputs)
     return RenderOutput(
         color=ad.Array3f(planes["color"]) if "color" in planes else None,
         alpha=planes["alpha"][0],
         depth=planes["depth"][0] if "depth" in planes else None,
         width=camera.width,
         height=camera.height,
-        median_depth=None if lists is None else median_depth(splats, lists, camera),
+        median_depth=median_depth(splats, lists, camera) if lists and "median_depth" in outputs else None,
         normal=ad.Array3f(planes["normal"]) if "normal" in planes else None,
         features=planes.get("features"),
     )
@@ -82,56 +84,40 @@ Planes = dict[str, list[Float]]
 """Planes of a picture, or what is blended to them, Floats [N], by the name of an output."""
 
 
+Inputs = tuple[list[Float], Projection, int | None, tuple[str, ...], Bool | bool]
+"""What `prepare` takes."""
+
+
 def _draw_in_stages(
-    rows: list[Float],
-    camera: Projection,
-    sh_degree: int | None,
-    outputs: tuple[str, ...],
-    antialiased: Bool | bool,
-    more: Planes,
-) -> tuple[Splats, TileLists | None, Planes]:
-    """(splats; the tiles' lists, if the median depth is wanted; planes). more: to be blended beside the outputs"""
-    splats, footprints, groups = prepare(rows, camera, sh_degree, outputs, antialiased)
-    groups |= more
-    blended = blend(splats, footprints, [f for group in groups.values() for f in group], camera)
-    lists = blended.lists if "median_depth" in outputs else None
-    return splats, lists, _finish(blended.planes, blended.transmittance, {k: len(v) for k, v in groups.items()})
+    splats: Splats, footprints: Footprints, groups: Planes, camera: Projection
+) -> tuple[TileLists | None, Planes]:
+    """(the tiles' lists, planes) of what is blended in any number of passes, differentiable."""
+    blended = blend(splats, footprints, [feature for group in groups.values() for feature in group], camera)
+    return blended.lists, _finish(blended.planes, blended.transmittance, groups)
 
 
-def _draw(
-    rows: list[Float],
-    camera: Projection,
-    sh_degree: int | None,
-    outputs: tuple[str, ...],
-    antialiased: Bool | bool,
-    more: Planes,
-) -> tuple[Splats, TileLists | None, Planes]:
-    """The same without gradients and in one pass: two recordings, between which the host waits for the number of
-    pairs. More passes in one recording would hold the memory of all of them."""
+def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats, TileLists | None, Planes]:
+    """(splats; the tiles' lists, if they are wanted; planes) without gradients and in one pass: two recordings, between
+    which the host waits for the number of pairs. More passes in one would hold the memory of all. more: blended beside
+    the outputs"""
+    rows, camera, *_ = inputs
     count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
-    live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
-    splats, footprints, groups, boxes = _prepare_boxes(rows, camera, sh_degree, outputs, antialiased, live, most, grid)
+    most = round_capacity(count)
+    splats, footprints, groups, boxes = _prepare_boxes(inputs, dr.opaque(ad.UInt32, count), most, grid)
+    groups |= more
     capacity = list_capacity(boxes.pairs(count), size[0] * size[1], few_sizes=True)
     if capacity == 0:
-        return _draw_in_stages(rows, camera, sh_degree, outputs, antialiased, more)
-    keeps = "median_depth" in outputs
-    lists, planes = _draw_boxes(splats, footprints, boxes, groups | more, size, capacity, most, grid, keeps)
+        return splats, *_draw_in_stages(splats, footprints, groups, camera)
+    lists, planes = _draw_boxes(splats, footprints, boxes, groups, size, capacity, most, grid, keeps_lists)
     return splats, lists, planes
 
 
 @recorded
 def _prepare_boxes(
-    rows: list[Float],
-    camera: Projection,
-    sh_degree: int | None,
-    outputs: tuple[str, ...],
-    antialiased: Bool | bool,
-    count: UInt32,
-    capacity: int,
-    grid: Grid,
+    inputs: Inputs, count: UInt32, capacity: int, grid: Grid
 ) -> tuple[Splats, Footprints, Planes, Boxes]:
     """`prepare`, and the boxes of the `count` splats [capacity]."""
-    splats, footprints, groups = prepare(rows, camera, sh_degree, outputs, antialiased)
+    splats, footprints, groups = prepare(*inputs)
     dr.eval(splats, footprints, groups)
     return splats, footprints, groups, make_boxes(splats, footprints, count, capacity, grid)
 
@@ -152,8 +138,7 @@ def _draw_boxes(
     lists = make_lists(splats, footprints, boxes, capacity, splat_capacity, grid)
     features = [feature for group in groups.values() for feature in group]
     blended = blend_lists(splats, features, lists, *size, splat_capacity)
-    counts = {name: len(group) for name, group in groups.items()}
-    return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, counts)
+    return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, groups)
 
 
 @recorded
@@ -185,10 +170,10 @@ def _clean(features: list[Float]) -> list[Float]:
     return [_finite(feature) for feature in features]
 
 
-def _finish(planes: list[Float], transmittance: Float, counts: dict[str, int]) -> Planes:
-    """Blended planes, so many by each name, with "alpha", expected depth and unit normals."""
+def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:
+    """Planes of what was blended by its names, with "alpha", expected depth and unit normals."""
     rest = iter(planes)
-    finished = {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
+    finished = {name: [next(rest) for _ in group] for name, group in groups.items()}
     finished["alpha"] = [1 - transmittance]
     if "depth" in finished:
         finished["depth"] = [over_alpha(finished["depth"][0], finished["alpha"][0])]
@@ -209,9 +194,9 @@ class BlendedPlanes:
 def blend(splats: Splats, footprints: Footprints, features: Sequence[Float], camera: Projection) -> BlendedPlanes:
     """Stages 2 and 3 for any number of features (Floats [N]) and any sign of depth. Differentiable."""
     lists = bin_splats(splats, footprints, camera.width, camera.height, few_sizes=True)
+    passes = [list(features[i : i + FEATURES_PER_PASS]) for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
     planes: list[Float] = []
     passed: list[Float] = []
-    passes = [list(features[i : i + FEATURES_PER_PASS]) for i in range(0, len(features), FEATURES_PER_PASS)] or [[]]
     for group in passes:
         group_planes, transmittance = rasterize(splats, group, lists, camera.width, camera.height)
         planes += group_planes
