@@ -191,7 +191,7 @@ class Sun:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether its centre is behind the Earth that it names: less than half of its disc gives light."""
+        """Whether its centre is behind the Earth that it names."""
         earth = self.earth
         return earth is not None and float(self.direction @ earth.direction) > np.cos(
             np.radians(earth.angular_radius_deg)
