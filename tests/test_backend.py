@@ -16,6 +16,7 @@ import pytest
 
 from spacesim import backend, doctor
 from spacesim.backend import llvm, memory, recording
+from spacesim.backend.flattening import flattener
 
 FAKE = "void LLVMGetVersion(unsigned *a, unsigned *b, unsigned *c) {{ *a = {}; *b = 1; *c = 7; }}\n"
 
@@ -238,9 +239,7 @@ def test_constants_are_all_that_is_no_array():
     def key(value):
         return recording._split(value, [])  # a key of dictionaries, to which 1, 1.0 and True are one
 
-    plain = [(1, x), (1.0, x), (True, x), ("1", x), (None, x), (x, None), ({"a": 1}, x), ({"a": x}, x), ((x,), x)]
-    plain += [(0.0, x), (-0.0, x), (_Pair(1), x), (_Pair(1.0), x), (_Pair((1, 2)), x), (_Pair(_Pair(1)), x)]
-    kinds = [*plain, ([x], x), ([x, x], x), ([1, x], x), ([[x], [x]], x), ([[x, x]], x), (_Pair(x, 1), x), ([], x)]
+    kinds = kinds_of_arguments(x)
     assert len({key(value) for value in kinds}) == len(kinds)
     assert key((x, 1)) == key((x + 1, 1))
     assert key(_Pair(1, "a")) == key(_Pair(1, "a")) != key(_Pair(1, "b"))
@@ -248,6 +247,32 @@ def test_constants_are_all_that_is_no_array():
     before = key(changing)
     changing.one.append(2)
     assert key(changing) != before
+
+
+def kinds_of_arguments(x):
+    """No two of the same structure."""
+    plain = [(1, x), (1.0, x), (True, x), ("1", x), (None, x), (x, None), ({"a": 1}, x), ({"a": x}, x), ((x,), x)]
+    plain += [(0.0, x), (-0.0, x), (_Pair(1), x), (_Pair(1.0), x), (_Pair((1, 2)), x), (_Pair(_Pair(1)), x)]
+    return [*plain, ([x], x), ([x, x], x), ([1, x], x), ([[x], [x]], x), ([[x, x]], x), (_Pair(x, 1), x), ([], x)]
+
+
+def test_code_for_one_structure_takes_the_arrays_of_no_other():
+    """Those of its own in the order in which they are walked through."""
+    large = [_Pair(tuple(range(10))), _Pair(tuple(range(11)))]
+    x, y = (backend.ad.Float(number, 2.0) for number in (1.0, 3.0))
+    first, second = ([*kinds_of_arguments(array), *((constant, array) for constant in large)] for array in (x, y))
+    for place, value in enumerate(first):
+        arrays, others = [], []
+        recording._split(value, arrays)
+        recording._split(second[place], others)
+        flatten = flattener((value,), {"n": value}, recording._leaves, recording._constants, recording._names)
+        for other, given in enumerate(second):
+            found = flatten((given,), {"n": given})
+            assert (found is None) == (other != place), (value, given)
+            if found is not None:
+                assert list(map(id, found)) == list(map(id, 2 * others))
+        assert flatten((value,), {"m": value}) is flatten((value, value), {"n": value}) is None
+        assert len(flatten((value,), {"n": value})) == 2 * len(arrays)
 
 
 def test_the_first_arrays_of_a_type_have_the_same_key_as_the_next(monkeypatch):

@@ -3,14 +3,18 @@
 import gc
 import itertools
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache, update_wrapper
 from operator import attrgetter
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
+from spacesim.backend.flattening import Flatten, flattener
+
 P = ParamSpec("P")
 R = TypeVar("R")
+RECENT = 4  #: structures of arguments that a call may have, before it is walked through for what it has
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
@@ -85,6 +89,10 @@ class Recorded(Generic[P, R]):
 
         update_wrapper(self, function)
         self.traced, self._elements, self._names = function, elements, _Names()
+        self._flatteners: dict[str, Flatten] = {}  # by names, of no more than there are recordings
+        self._recent: deque[str] = deque(maxlen=RECENT)  # names, the latest walked through last
+        self._latest: str | None = None  # name of the latest call
+        self._after: dict[str | None, str] = {}  # names, and what came next the last time
         now = self._now = _Arguments(function)
 
         # Dr.Jit walks through what a function has from outside at every call, but not through its defaults.
@@ -102,14 +110,11 @@ class Recorded(Generic[P, R]):
     def _call(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> R:
         if self._flag(self._scope):
             return self.traced(*arguments, **named)
-        arrays: list[Any] = []
-        kind = _split(arguments, arrays)
-        if named:
-            kind = kind, _split(named, arrays)
+        name, arrays = self._flat(arguments, named)
         about_one = self._elements is not None and self._elements(arrays, *arguments, **named) == 1
         if about_one or self._has_gradients(arrays):
             return self.traced(*arguments, **named)
-        name, now = self._names[kind], self._now
+        now = self._now
         now.arguments, now.named = arguments, named
         collecting = gc.isenabled()
         gc.disable()
@@ -120,6 +125,23 @@ class Recorded(Generic[P, R]):
             now.arguments, now.named = (), {}
             if collecting:
                 gc.enable()
+
+    def _flat(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[str, list[Any]]:
+        """A text for all that is no array, and the arrays."""
+        for name in (self._after.get(self._latest), *self._recent):
+            flat = self._flatteners[name](arguments, named) if name else None
+            if name and flat is not None:
+                break
+        else:
+            flat = []
+            name = self._names[_split(arguments, flat), _split(named, flat)]
+            if name not in self._flatteners:
+                if len(self._flatteners) >= RECORDINGS:
+                    return name, flat
+                self._flatteners[name] = flattener(arguments, named, _leaves, _constants, _names)
+            self._recent.append(name)
+        self._after[self._latest] = self._latest = name
+        return name, flat
 
 
 _one_at_a_time = threading.RLock()
