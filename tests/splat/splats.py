@@ -2,8 +2,11 @@
 
 import numpy as np
 
+from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
+from spacesim.splat.train.strategies.strategy import OnScreen
 
 
 def light_of(values: np.ndarray) -> np.ndarray:
@@ -29,3 +32,10 @@ def random_splats(count: int, seed: int = 0, degree: int = 3) -> dict[str, np.nd
 
 def device_camera(view: Camera | OrthographicCamera) -> Pinhole | Orthographic:
     return Pinhole.of(view) if isinstance(view, Camera) else Orthographic.of(view)
+
+
+def on_screen(gradient: np.ndarray, radius: np.ndarray, visible: np.ndarray) -> OnScreen:
+    """Of a picture of two pixels a side, [N] each: gradients by half a picture, radii as shares of it."""
+    radii = np.where(visible, np.maximum(2.0 * np.asarray(radius), 1e-9), 0)
+    across, along = (upload(np.asarray(rows, np.float32)) for rows in (gradient, np.zeros(len(radii))))
+    return OnScreen(across, along, upload(np.asarray(radii, np.float32)), ad.Float([1.0, 1.0, 2.0]))

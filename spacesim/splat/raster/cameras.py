@@ -6,6 +6,7 @@ gradients with respect to the pose and the intrinsics are those of the array.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TypeVar
 
 import drjit as dr
@@ -18,6 +19,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 
 NEAR = 0.01  #: metres; a perspective camera does not draw Gaussians whose centre is nearer
+KEPT = 4096  #: cameras whose numbers are kept: training shows the same ones again and again
 MAX_MAGNITUDE = 1e9  #: bound on lengths in metres and on footprints in pixels: their squares stay finite in float32
 
 Self = TypeVar("Self", bound="Projection")
@@ -155,11 +157,7 @@ class Pinhole(Projection):
     @staticmethod
     def of(camera: Camera) -> "Pinhole":
         """Upload a `Camera` record."""
-        left, right = ((edge * camera.width - camera.cx) / camera.fx for edge in (-0.15, 1.15))
-        top, bottom = ((edge * camera.height - camera.cy) / camera.fy for edge in (-0.15, 1.15))
-        intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-        values = _upload(camera.camera_from_world, intrinsics, (left, right, top, bottom))
-        return Pinhole(values, camera.width, camera.height)
+        return Pinhole(ad.Float(_pinhole_numbers(camera)), camera.width, camera.height)
 
     @property
     def position(self) -> Array3f:
@@ -194,7 +192,7 @@ class Orthographic(Projection):
     def of(camera: OrthographicCamera) -> "Orthographic":
         """Upload an `OrthographicCamera` record."""
         intrinsics = camera.scale_x, camera.scale_y, camera.cx, camera.cy
-        return Orthographic(_upload(camera.camera_from_world, intrinsics, ()), camera.width, camera.height)
+        return Orthographic(ad.Float(_numbers(camera.camera_from_world, intrinsics, ())), camera.width, camera.height)
 
     def in_reach(self, center: Array3f) -> Bool:
         return dr.max(dr.abs(center)) < MAX_MAGNITUDE
@@ -213,6 +211,14 @@ class Orthographic(Projection):
         return self.row(2) + dr.zeros(ad.Array3f, dr.width(points))
 
 
-def _upload(camera_from_world: Array, intrinsics: tuple[float, ...], lengths: tuple[float, ...]) -> Float:
-    numbers = [*camera_from_world[:3].ravel().tolist(), *map(float, intrinsics), 0.0, 0.0, *map(float, lengths)]
-    return ad.Float(numbers)  # no numpy array: see `backend.recorded`
+@lru_cache(maxsize=KEPT)
+def _pinhole_numbers(camera: Camera) -> list[float]:
+    left, right = ((edge * camera.width - camera.cx) / camera.fx for edge in (-0.15, 1.15))
+    top, bottom = ((edge * camera.height - camera.cy) / camera.fy for edge in (-0.15, 1.15))
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return _numbers(camera.camera_from_world, intrinsics, (left, right, top, bottom))
+
+
+def _numbers(camera_from_world: Array, intrinsics: tuple[float, ...], lengths: tuple[float, ...]) -> list[float]:
+    """What an array is made of: no numpy array, see `backend.recorded`."""
+    return [*camera_from_world[:3].ravel().tolist(), *map(float, intrinsics), 0.0, 0.0, *map(float, lengths)]

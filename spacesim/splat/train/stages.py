@@ -151,15 +151,6 @@ def picture_loss(
     return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
 
 
-def on_screen(absolute: tuple[Float, Float], radii: Float, sizes: Float) -> tuple[Float, Float, Bool]:
-    """What densification watches, [N] each: the norm of the absolute gradient by half a picture, the radius as a share
-    of the picture's longer side, and who is in the picture. absolute: by x and y, a pixel;  radii: of `screen_radii`;
-    sizes: Float [3], half the picture's width and height, its longer side"""
-    half_width, half_height, longer = (dr.gather(ad.Float, sizes, ad.UInt32(i)) for i in range(3))
-    gradient = dr.sqrt(dr.square(absolute[0] * half_width) + dr.square(absolute[1] * half_height))
-    return gradient, radii / longer, radii > 0
-
-
 def update_light(
     weights: list[Float], moments: tuple[list[Float], list[Float]], gradients: list[list[Float]], factors: Float
 ) -> tuple[list[Float], list[Float], list[Float]]:

@@ -172,7 +172,7 @@ class Trainer(TrainingLoop):
                 drawn, loss, grad_splats = self._splat_gradients(rows, degree, view, target, watched)
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
-            self.strategy.observe(*view_pass.watched(drawn, grad_splats))
+            self.strategy.observe(view_pass.watched(drawn, grad_splats))
         grad_rows = self._add_attraction(rows, view, attraction) if attraction else []
         result = view_pass.to_gradients(drawn, loss, grad_splats, self.light, grad_rows)
         self.pictures.learn_sun(self.iteration, view, result.by_sun)

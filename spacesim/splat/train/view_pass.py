@@ -5,14 +5,15 @@ change length from step to step, stand between them.
 """
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Bool, Float
+from spacesim.backend.arrays import Float
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.cameras import KEPT
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
@@ -21,7 +22,8 @@ from spacesim.splat.raster.tiles import TileLists
 from spacesim.splat.train.async_lists import AsyncTileLists
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients
-from spacesim.splat.train.stages import LossSettings, TargetImage, on_screen, picture_loss, project_views
+from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss, project_views
+from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
 
@@ -104,7 +106,7 @@ class ViewPass:
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
         self._project = recorded(project_views)
         self._loss = recorded(picture_loss)
-        self._on_screen = recorded(on_screen)
+        self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
         self,
@@ -119,7 +121,7 @@ class ViewPass:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
         see `RenderedView`;  watched: whether densification wants to know of it"""
         config = self.config
-        camera = Pinhole.of(upsampled_camera(view.camera.downscaled(downscale), config.supersample))
+        camera = Pinhole.of(_blended_camera(view.camera, downscale, config.supersample))
         splats, footprints, values, radii = self._project(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
         )
@@ -154,13 +156,17 @@ class ViewPass:
             tape.splats, tape.blended, tape.lists, size, loss.grad_planes, loss.grad_transmittance, absolute=absolute
         )
 
-    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> tuple[Float, Float, Bool]:
-        """What densification watches of a view, see `on_screen`."""
+    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> OnScreen:
+        """What densification watches of a view."""
         assert drawn.radii is not None, "radii are there where refinement watches"
-        width, height = drawn.camera.width, drawn.camera.height
-        sizes = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
-        gradient, radius, seen = self._on_screen((grad_splats.absolute_x, grad_splats.absolute_y), drawn.radii, sizes)
-        return gradient, radius, seen
+        return OnScreen(grad_splats.absolute_x, grad_splats.absolute_y, drawn.radii, self._sizes(drawn.camera))
+
+    def _sizes(self, camera: Pinhole) -> Float:
+        """Of its pictures, as `OnScreen` has them."""
+        size = camera.width, camera.height
+        if size not in self._screen_sizes:
+            self._screen_sizes[size] = ad.Float([0.5 * camera.width, 0.5 * camera.height, max(size)])
+        return self._screen_sizes[size]
 
     def to_gradients(
         self,
@@ -184,6 +190,11 @@ class ViewPass:
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
+
+
+@lru_cache(maxsize=KEPT)
+def _blended_camera(camera: Camera, downscale: int, supersample: int) -> Camera:
+    return upsampled_camera(camera.downscaled(downscale), supersample)
 
 
 def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:

@@ -19,7 +19,7 @@ from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, stack_rows
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.densify import DensificationCounts, append_copies, grow, limit_opacities, prune
-from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, Strategy
+from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, OnScreen, Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
 
@@ -105,12 +105,13 @@ class DensityControl(Strategy):
     def observes_step(self, step: int) -> bool:
         return step < self.config.refine_stop
 
-    def observe(self, gradient: Float, radius: Float, visible: Bool) -> None:
-        seen = {name: values for name, values in self.state.items() if name not in self.unseen}
-        self.state |= self._observed(seen, gradient, radius, visible)
+    def observe(self, seen: OnScreen) -> None:
+        state = {name: values for name, values in self.state.items() if name not in self.unseen}
+        self.state |= self._observed(state, seen)
 
-    def _observation(self, state: dict[str, Float], gradient: Float, radius: Float, visible: Bool) -> dict[str, Float]:
+    def _observation(self, state: dict[str, Float], seen: OnScreen) -> dict[str, Float]:
         """The state with an observation more."""
+        gradient, radius, visible = seen.measures()
         state = dict(state)
         state["gradient"] = state["gradient"] + dr.select(visible, gradient, 0)
         state["seen"] = state["seen"] + dr.select(visible, ad.Float(1), 0)

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Bool, Float, UInt64
+from spacesim.backend.arrays import Float, UInt64
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import check_fields
@@ -19,7 +19,7 @@ from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.densify import DensificationCounts, rearrange
-from spacesim.splat.train.strategies.strategy import Strategy
+from spacesim.splat.train.strategies.strategy import OnScreen, Strategy
 
 MAX_COPIES = 51  #: of one Gaussian whose sum of binomials is computed, as the paper's code has it; more count as 51
 GOLDEN = 0x9E3779B97F4A7C15  #: 2^64 over the golden ratio
@@ -72,7 +72,7 @@ class McmcStrategy(Strategy):
     def observes_step(self, step: int) -> bool:
         return False
 
-    def observe(self, gradient: Float, radius: Float, visible: Bool) -> None:
+    def observe(self, seen: OnScreen) -> None:
         pass
 
     def add_noise(self, step: int, gaussians: Gaussians, rate: float, seed: int) -> None:

@@ -5,9 +5,12 @@ Gaussians and the optimizer whose moments have to follow them.
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
+import drjit as dr
 import numpy as np
 
+from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.optimizer.adam import Adam
@@ -15,6 +18,23 @@ from spacesim.splat.train.strategies.densify import DensificationCounts
 
 MAX_STEPS = 10**9  #: of any count of iterations that is configured
 MAX_THRESHOLD = 1e6  #: of any threshold or length that is configured
+
+
+@dataclass
+class OnScreen:
+    """What a view of a step says of each Gaussian, [N] but for `sizes`."""
+
+    absolute_x: Float  #: absolute gradient by the place on the screen, per pixel
+    absolute_y: Float  #: likewise
+    radii: Float  #: three standard deviations on the screen, pixels, 0 of what is not in the picture
+    sizes: Float  #: Float [3], half the picture's width and height, its longer side, pixels
+
+    def measures(self) -> tuple[Float, Float, Bool]:
+        """The norm of the gradient by half a picture, the radius as a share of the picture's longer side, and who is in
+        the picture, however faint."""
+        half_width, half_height, longer = (dr.gather(ad.Float, self.sizes, ad.UInt32(i)) for i in range(3))
+        gradient = dr.sqrt(dr.square(self.absolute_x * half_width) + dr.square(self.absolute_y * half_height))
+        return gradient, self.radii / longer, self.radii > 0
 
 
 class Strategy(ABC):
@@ -28,10 +48,8 @@ class Strategy(ABC):
         """Whether `observe` is wanted after step number `step`, the first of which is 1."""
 
     @abstractmethod
-    def observe(self, gradient: Float, radius: Float, visible: Bool) -> None:
-        """After each view of a step. gradient: norm of the absolute screen-space gradient [N]; radius: three standard
-        deviations on the screen as a fraction of the image's longer side [N]; visible: [N] bool, what is in the
-        picture, however faint."""
+    def observe(self, seen: OnScreen) -> None:
+        """After each view of a step."""
 
     @abstractmethod
     def refine(

@@ -6,6 +6,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from splats import on_screen
 
 from spacesim.backend import ad, select
 from spacesim.backend.upload import upload
@@ -116,8 +117,7 @@ def refine_once(
     zeros = np.zeros(6)
     gradient, radius = state.get("gradient", zeros), state.get("radius", zeros)
     for _ in range(2):
-        values = [upload(np.asarray(v, dtype=np.float32)) for v in (gradient, radius)]
-        strategy.observe(*values, ad.Bool([True] * 5 + [False]))
+        strategy.observe(on_screen(gradient, radius, np.array([True] * 5 + [False])))
     means = np.array(model.means).T.copy()
     done = strategy.refine(step, model, optimizer, np.random.default_rng(0))
     return strategy, model, means, (done.duplicated, done.split, done.pruned)

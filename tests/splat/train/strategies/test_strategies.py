@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.integrate import quad
+from splats import on_screen
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
@@ -79,9 +80,7 @@ def show(strategy: Strategy, gradient, radius=None, visible=None, times: int = 1
     radius = np.zeros(count) if radius is None else radius
     visible = np.ones(count, bool) if visible is None else visible
     for _ in range(times):
-        strategy.observe(
-            upload(np.asarray(gradient, np.float32)), upload(np.asarray(radius, np.float32)), upload(visible, ad.Bool)
-        )
+        strategy.observe(on_screen(gradient, radius, visible))
 
 
 def refine(strategy: Strategy, gaussians: Gaussians, step: int = STEP, leniency: float = 1.0):
