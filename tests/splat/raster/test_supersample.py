@@ -223,9 +223,9 @@ def test_refinement_watches_the_same_gradients_and_sizes(small_dataset, monkeypa
         trainer = Trainer(small_dataset, config)
         seen = []
         monkeypatch.setattr(trainer.strategy, "observes_step", lambda _step: True)
-        monkeypatch.setattr(trainer.strategy, "observe", lambda *given, seen=seen: seen.append(given))
+        monkeypatch.setattr(trainer.strategy, "observe", seen.append)
         trainer.step()
-        gradient, radius, visible = (np.array(values) for values in seen[0])
+        gradient, radius, visible = (np.array(values) for values in seen[0].measures())
         found.append([gradient[visible].mean(), radius[visible].mean()])
     np.testing.assert_allclose(found[1], found[0], rtol=0.15)
 
