@@ -265,7 +265,7 @@ def test_code_for_one_structure_takes_the_arrays_of_no_other():
         arrays, others = [], []
         recording._split(value, arrays)
         recording._split(second[place], others)
-        flatten = flattener((value,), {"n": value}, recording._leaves, recording._constants, recording._names)
+        flatten = flattener((value,), {"n": value}, recording._leaves, recording._constants, recording._field_names)
         for other, given in enumerate(second):
             found = flatten((given,), {"n": given})
             assert (found is None) == (other != place), (value, given)
@@ -273,6 +273,16 @@ def test_code_for_one_structure_takes_the_arrays_of_no_other():
                 assert list(map(id, found)) == list(map(id, 2 * others))
         assert flatten((value,), {"m": value}) is flatten((value, value), {"n": value}) is None
         assert len(flatten((value,), {"n": value})) == 2 * len(arrays)
+
+
+def test_more_structures_than_code_is_kept_for(monkeypatch):
+    """In turn, then one again and again."""
+    monkeypatch.setattr(recording, "RECORDINGS", 3)
+    x = backend.ad.Float(1.0, 2.0)
+    scaled = backend.recorded(lambda x, factors: x * sum(factors))
+    for count in [*range(6), *range(6), *range(6), 4, 4, 4, 2, 4]:
+        assert scaled(x, tuple(range(count))).numpy() == pytest.approx(x.numpy() * sum(range(count)))
+    assert len(scaled._flatteners) == 3
 
 
 def test_the_first_arrays_of_a_type_have_the_same_key_as_the_next(monkeypatch):

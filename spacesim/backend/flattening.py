@@ -19,7 +19,7 @@ def flattener(
     constants: Mapping[int, tuple[Any, Any]],
     names_of_fields: Callable[[type], tuple[str, ...] | None],
 ) -> Flatten:
-    """For all calls of the structure of this one.
+    """For calls of the structure of this one, to which `recording._split` gives the same key, and for no others.
 
     leaves: types of arrays, as known when called;  constants: objects whose second entry says all of them, by `id`;
     names_of_fields: of a record, None of what is none

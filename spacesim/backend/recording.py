@@ -89,7 +89,7 @@ class Recorded(Generic[P, R]):
 
         update_wrapper(self, function)
         self.traced, self._elements, self._names = function, elements, _Names()
-        self._flatteners: dict[str, Flatten] = {}  # by names, of no more than there are recordings
+        self._flatteners: dict[str | None, Flatten] = {}  # by names, of no more than there are recordings
         self._recent: deque[str] = deque(maxlen=RECENT)  # names, the latest walked through last
         self._latest: str | None = None  # name of the latest call
         self._after: dict[str | None, str] = {}  # names, and what came next the last time
@@ -128,18 +128,24 @@ class Recorded(Generic[P, R]):
 
     def _flat(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[str, list[Any]]:
         """A text for all that is no array, and the arrays."""
-        for name in (self._after.get(self._latest), *self._recent):
-            flat = self._flatteners[name](arguments, named) if name else None
-            if name and flat is not None:
+        for name in (self._after.get(self._latest), *self._recent):  # calls come in the same order step by step
+            flatten = self._flatteners.get(name)
+            flat = flatten(arguments, named) if flatten else None
+            if flat is not None:
                 break
         else:
             flat = []
-            name = self._names[_split(arguments, flat), _split(named, flat)]
-            if name not in self._flatteners:
+            kind = _split(arguments, flat), _split(named, flat)
+            is_known, name = kind in self._names, self._names[kind]
+            if is_known and name not in self._flatteners:  # what is seen once is not worth code
                 if len(self._flatteners) >= RECORDINGS:
-                    return name, flat
-                self._flatteners[name] = flattener(arguments, named, _leaves, _constants, _names)
+                    del self._flatteners[next(iter(self._flatteners))]
+                    self._after.clear()
+                self._flatteners[name] = flattener(arguments, named, _leaves, _constants, _field_names)
+            if name not in self._flatteners:
+                return name, flat
             self._recent.append(name)
+        assert name is not None
         self._after[self._latest] = self._latest = name
         return name, flat
 
@@ -182,7 +188,8 @@ _names_of_constants = _Names()
 
 
 def _split(value: Any, arrays: list[Any]) -> Any:
-    """All of `value` that is no array, as a key of dictionaries; its arrays are added to a list."""
+    """All of `value` that is no array, as a key of dictionaries; its arrays are added to a list. `flattener` writes
+    code that tells the same values apart."""
     kind = type(value)
     if kind in _EQUAL_TO_INTEGERS:
         return kind, repr(value)
@@ -247,7 +254,7 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
         return kind(_joined(item, arrays) for item in value)
     if kind is dict:
         return {key: _joined(item, arrays) for key, item in value.items()}
-    names = _names(kind)  # type: ignore[arg-type]
+    names = _field_names(kind)  # type: ignore[arg-type]
     if names is None:
         return next(arrays)
     copy = object.__new__(kind)
@@ -257,15 +264,15 @@ def _joined(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 @cache
-def _names(kind: object) -> tuple[str, ...] | None:
+def _field_names(kind: object) -> tuple[str, ...] | None:
     """Of a dataclass's fields; None for any other type."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None
 
 
 @cache
 def _values_of(kind: object) -> Callable[[object], tuple[Any, ...]] | None:
-    """A getter of the fields of a dataclass, in the order of `_names`; None for any other type."""
-    names = _names(kind)
+    """A getter of the fields of a dataclass, in the order of `_field_names`; None for any other type."""
+    names = _field_names(kind)
     if names is None:
         return None
     if len(names) > 1:

@@ -6,7 +6,6 @@ gradients with respect to the pose and the intrinsics are those of the array.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TypeVar
 
 import drjit as dr
@@ -19,7 +18,6 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
 
 NEAR = 0.01  #: metres; a perspective camera does not draw Gaussians whose centre is nearer
-KEPT = 4096  #: cameras whose numbers are kept: training shows the same ones again and again
 MAX_MAGNITUDE = 1e9  #: bound on lengths in metres and on footprints in pixels: their squares stay finite in float32
 
 Self = TypeVar("Self", bound="Projection")
@@ -157,7 +155,7 @@ class Pinhole(Projection):
     @staticmethod
     def of(camera: Camera) -> "Pinhole":
         """Upload a `Camera` record."""
-        return Pinhole(ad.Float(_pinhole_numbers(camera)), camera.width, camera.height)
+        return Pinhole(ad.Float(pinhole_numbers(camera)), camera.width, camera.height)
 
     @property
     def position(self) -> Array3f:
@@ -211,8 +209,8 @@ class Orthographic(Projection):
         return self.row(2) + dr.zeros(ad.Array3f, dr.width(points))
 
 
-@lru_cache(maxsize=KEPT)
-def _pinhole_numbers(camera: Camera) -> list[float]:
+def pinhole_numbers(camera: Camera) -> list[float]:
+    """What `Pinhole.of` uploads."""
     left, right = ((edge * camera.width - camera.cx) / camera.fx for edge in (-0.15, 1.15))
     top, bottom = ((edge * camera.height - camera.cy) / camera.fy for edge in (-0.15, 1.15))
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy

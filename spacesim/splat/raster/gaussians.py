@@ -98,11 +98,6 @@ class Gaussians:
         for name in (*NAMES, "features"):
             setattr(self, name, getattr(other, name))
 
-    def clear(self) -> None:
-        """Let go of all parameters, until `replace` brings others."""
-        self.means, self.log_scales, self.quaternions = ad.Array3f(), ad.Array3f(), ad.Array4f()
-        self.logit_opacities, self.sh, self.features = ad.Float(), ad.ArrayXf(), None
-
     def to_numpy(self) -> dict[str, np.ndarray]:
         """{name: float32 array with N first}: means [N, 3], log_scales [N, 3], quaternions [N, 4],
         logit_opacities [N], sh [N, K, 3]; features [N, F] where there are any."""

@@ -13,7 +13,7 @@ from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward, forward
-from spacesim.splat.raster.cameras import KEPT
+from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
@@ -25,6 +25,8 @@ from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss, project_views
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
+
+KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
 
 
 @dataclass
@@ -106,6 +108,7 @@ class ViewPass:
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
         self._project = recorded(project_views)
         self._loss = recorded(picture_loss)
+        self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -121,7 +124,7 @@ class ViewPass:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
         see `RenderedView`;  watched: whether densification wants to know of it"""
         config = self.config
-        camera = Pinhole.of(_blended_camera(view.camera, downscale, config.supersample))
+        camera = self._camera(view.camera, downscale)
         splats, footprints, values, radii = self._project(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
         )
@@ -137,6 +140,11 @@ class ViewPass:
         blended = forward(splats, planes, lists, *size, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
+
+    def _camera(self, camera: Camera, downscale: int) -> Pinhole:
+        """With as many pixels as are blended of a view."""
+        numbers, width, height = self._camera_numbers(camera, downscale)
+        return Pinhole(ad.Float(numbers), width, height)
 
     def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
         """Compare a view that was drawn. camera: of the target"""
@@ -192,9 +200,9 @@ class ViewPass:
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 
 
-@lru_cache(maxsize=KEPT)
-def _blended_camera(camera: Camera, downscale: int, supersample: int) -> Camera:
-    return upsampled_camera(camera.downscaled(downscale), supersample)
+def _camera_numbers(supersample: int, camera: Camera, downscale: int) -> tuple[list[float], int, int]:
+    blended = upsampled_camera(camera.downscaled(downscale), supersample)
+    return pinhole_numbers(blended), blended.width, blended.height
 
 
 def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:

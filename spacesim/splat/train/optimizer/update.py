@@ -90,26 +90,34 @@ class Update:
             self.surfels,
         )
         del packed, of_own
-        gaussians.clear()  # so that old rows go as new ones come
-        try:
-            rows[optimizer.slices[0]], optimizer.arrays[0] = moved
-            if grad_features:
-                rows[-1], optimizer.features = self._features(rows[-1], optimizer.features, grad_features, factors)
-            for number, part in enumerate(optimizer.slices[1:], 1):
-                first = (part.start - OWN) // 3
-                if first >= (degree + 1) ** 2:
-                    break
-                packed = optimizer.arrays[number], optimizer.layouts[number]
-                step = self._harmonics(rows[part], packed, first, degree, means, cameras, grad_sums, factors)
-                del packed
-                rows[part], optimizer.arrays[number] = step
-                del step
-        finally:
+        _replace(gaussians, optimizer, rows, 0, *moved)
+        if gaussians.features is not None:
+            rows[-1], optimizer.features = self._features(rows[-1], optimizer.features, grad_features, factors)
             gaussians.replace(rows)
+            return
+        for number, part in enumerate(optimizer.slices[1:], 1):
+            first = (part.start - OWN) // 3
+            if first >= (degree + 1) ** 2:
+                break
+            packed = optimizer.arrays[number], optimizer.layouts[number]
+            step = self._harmonics(rows[part], packed, first, degree, means, cameras, grad_sums, factors)
+            del packed
+            _replace(gaussians, optimizer, rows, number, *step)
 
 
 def _without_features(view: ViewGradients) -> tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]:
     return view.camera, view.grad_splats, view.grad_values, view.grad_rows
+
+
+def _replace(
+    gaussians: Gaussians, optimizer: Adam, rows: list[Float], number: int, moved: list[Float], moments: list[Float]
+) -> None:
+    """Put a part's new rows and moments in the place of the old ones, which are released."""
+    rows[optimizer.slices[number]], optimizer.arrays[number] = moved, moments
+    if number == 0:
+        gaussians.replace(rows)
+    else:
+        gaussians.sh = ad.ArrayXf(rows[ROWS["sh"]])
 
 
 def _move_own(

@@ -1,7 +1,7 @@
 """What every strategy of densification is: it watches steps, and now and then changes the set of Gaussians.
 
-It knows nothing of pictures, losses or cameras: a trainer gives it gradients and radii on the screen, and hands it
-Gaussians and the optimizer whose moments have to follow them.
+It knows nothing of losses or cameras, and of pictures their size: a trainer gives it gradients and radii on the screen,
+and hands it Gaussians and the optimizer whose moments have to follow them.
 """
 
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ MAX_STEPS = 10**9  #: of any count of iterations that is configured
 MAX_THRESHOLD = 1e6  #: of any threshold or length that is configured
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class OnScreen:
     """What a view of a step says of each Gaussian, [N] but for `sizes`."""
 
