@@ -1,6 +1,6 @@
 """Trains the methods of light on one dataset and compares them under Suns that they know and Suns never seen.
 
-    python benchmarks/shadows.py --data DATA --out RUNS [--preset fast] [--iterations N] [--rows thesis,ours]
+    python benchmarks/shadows.py --data DATA --out RUNS [--preset fast] [--iterations N] [--seed N] [--rows thesis,ours]
     python benchmarks/shadows.py --out RUNS
 
 Without DATA it makes one first: boxsat, 16 Suns x 40 views of 256 pixels, evaluated under these and under 8 never seen.
@@ -58,6 +58,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="RUNS")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--iterations", type=int, metavar="N")
+    parser.add_argument("--seed", type=int, help="of each training (0)")
     parser.add_argument("--rows", default=",".join(ROWS), help="of thesis,ours, or names of single rows")
     parser.add_argument("--no-geometry", action="store_true", help="do not evaluate shapes")
     parser.add_argument("--markdown", action="store_true")
@@ -74,7 +75,7 @@ def main() -> None:
     results: dict[str, Any] = {}
     for name, (kind, config) in table.items():
         if kind in wanted or name in wanted:
-            config = with_options(config, iterations=options.iterations)
+            config = with_options(config, iterations=options.iterations, seed=options.seed)
             results[name] = common.measured(name, config, evaluation, dataset, options.out / name)
     evaluated = [options.out / name / "eval" for name, result in results.items() if "note" not in result]
     if evaluated:

@@ -9,7 +9,7 @@ from spacesim.splat.light.field import FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 
-MAX_EMITTERS = 2**14  #: of one bounce
+MAX_EMITTERS = 2**14  #: of one bounce; `Surroundings.seen` numbers their sides in 16 bits
 MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
 
 
@@ -19,7 +19,7 @@ class LightConfig:
 
     field: FieldConfig = field(default_factory=FieldConfig)  #: the network that gives colours
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
-    #: so many of the Gaussians scatter sunlight onto all others, once and as if nothing stood in between; 0 for none
+    #: so many of the Gaussians, each for those around it, scatter sunlight once onto all that see them; 0 for none
     bounce: int = 0
     #: of the bounce: Gaussians scatter what the field paints, not what their albedos say, and mirror what arrives, by a
     #: specular reflectance that each learns, too; without a bounce it says nothing

@@ -28,11 +28,13 @@ from spacesim.splat.light.shading import ShadingInputs, ShadingTape, split_weigh
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
+from spacesim.splat.light.surroundings import Surfaces, Surroundings, look_around
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
 
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
+GEOMETRY = 11  #: rows of Gaussians that say where they are, how large, how turned and how opaque
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
 
@@ -92,6 +94,14 @@ class _PictureCache:
 
 
 @dataclass
+class _Around:
+    """What the Gaussians that were looked at last see around them: their light changes more often than they do."""
+
+    read: list[Float]  #: the arrays that it was made of
+    surroundings: Surroundings | None
+
+
+@dataclass
 class _LastSunlight:
     """The Sun that was asked for last: cameras move more often than it does."""
 
@@ -129,6 +139,8 @@ class LightModel:
         self._training_frame = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
         self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
         self._cache = _PictureCache([], None, [], [])
+        self._around = _Around([], None)
+        self._held: Surfaces | None = None
         self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
 
     @staticmethod
@@ -181,6 +193,35 @@ class LightModel:
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
 
+    def surroundings(self, gaussians: Gaussians) -> Surroundings | None:
+        """What these see around them, or saw at the last `hold_surroundings`; None for a model without a bounce."""
+        if not self.config.bounce:
+            return None
+        read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
+        if self._held is None and not _are_same(read, self._around.read):
+            self._around = _Around([], None)  # frees memory for the next
+            self._around = _Around(_kept(read), self._look_around(self._surfaces(gaussians)))
+        return self._around.surroundings
+
+    def hold_surroundings(self, of: Gaussians | Surfaces | None) -> None:
+        """In training Gaussians move in each step: light bounces as if they stood where these do, as many as they are,
+        until this is called again. None: where they stand"""
+        self._held = self._surfaces(of) if isinstance(of, Gaussians) else of
+        self._around = _Around([], None)
+        if self._held is not None:
+            self._around = _Around([], self._look_around(self._held))
+
+    @property
+    def held_surfaces(self) -> Surfaces | None:
+        """Of the last `hold_surroundings`."""
+        return self._held
+
+    def _surfaces(self, gaussians: Gaussians) -> Surfaces:
+        return Surfaces.of(gaussians, self.config.field.features)
+
+    def _look_around(self, surfaces: Surfaces) -> Surroundings:
+        return look_around(surfaces, self.config.bounce, self.frame.radius)
+
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for
         last and nothing has changed. embedding: as `shade_picture` takes it"""
@@ -202,8 +243,8 @@ class LightModel:
         of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun), of_picture)
         inputs = self._inputs(gaussians, None, terms, shadows)
-        visibility, bounced, emitters = kernels.cast_sunlight(self.config, self.weights, inputs, batch)
-        return Sunlight(visibility[0] if visibility else None, bounced, emitters)
+        visibility, bounced, emitted = kernels.cast_sunlight(self.config, self.weights, inputs, batch)
+        return Sunlight(visibility[0] if visibility else None, bounced, emitted)
 
     def shade_picture(
         self,
@@ -320,6 +361,7 @@ class LightModel:
             raw_shadows,
             sun,
             self._training_frame,
+            self.surroundings(gaussians),
         )
 
     def _picture_cache(self, features: Float, batch: PaddedBatch) -> _PictureCache:

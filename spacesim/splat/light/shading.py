@@ -18,14 +18,13 @@ from spacesim.splat.light.bounce import (
     add_irradiance,
     add_irradiance_slopes,
     albedo_radiance,
-    choose,
+    emission,
+    gathered,
     grazing_reflectance,
     grazing_reflectance_slope,
     irradiance,
     lit_normals,
     mirroring,
-    received,
-    scattering,
 )
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
@@ -48,6 +47,7 @@ from spacesim.splat.light.shadow.refine import (
     refine_occlusion_slope,
 )
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
+from spacesim.splat.light.surroundings import Surroundings
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import across
 from spacesim.splat.raster.tone import decode_srgb
@@ -67,6 +67,7 @@ class ShadingInputs:
     raw_shadows: list[Float]  #: occlusion, normal alignment, light extent and bias, [N] each, or nothing
     sun: SunEncoding  #: as networks and shadows read it
     training_frame: Float  #: Float [4], centre and scale of the training frame
+    surroundings: Surroundings | None  #: None without a bounce
 
 
 @dataclass
@@ -96,8 +97,8 @@ def shade(
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
     dr.eval(outputs, colors, occlusion, faces)
-    emitters = _emitters(config, field_weights, inputs, [1 - value for value in occlusion], batch)
-    light = _received(config, inputs, emitters, batch, sides=True, mirrors=config.mirrors)
+    emitted = _emitted(config, field_weights, inputs, [1 - value for value in occlusion], batch)
+    light = _received(config, inputs, emitted, batch, sides=True, mirrors=config.mirrors)
     scattered = _scattered(config, inputs, light[:6], light[6:], batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
@@ -131,7 +132,7 @@ def shade_picture(
     visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
     shown = _dimmed(inputs.sun, colors, visibility, faces)
     bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
-    mirrored = _received(config, inputs, sunlight.emitters, batch, sides=False, mirrors=True)
+    mirrored = _received(config, inputs, sunlight.emitted, batch, sides=False, mirrors=True)
     scattered = _scattered(config, inputs, bounced, mirrored, batch)
     for share in sunlight.mirrored:
         scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
@@ -145,15 +146,15 @@ def shade_picture(
 def cast_sunlight(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
 ) -> tuple[list[Float], list[Float], list[Float]]:
-    """([refined visibility [N]] or [], light that bounces and its emitters, see `Sunlight`)."""
+    """([refined visibility [N]] or [], light that bounces and what is emitted, see `Sunlight`)."""
     field_weights, refine_weights = split_weights(config, weights)
     visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
     dr.eval(visibility)
-    emitters = _emitters(config, field_weights, inputs, visibility, batch)
-    bounced = _received(config, inputs, emitters, batch, sides=True, mirrors=False)
+    emitted = _emitted(config, field_weights, inputs, visibility, batch)
+    bounced = _received(config, inputs, emitted, batch, sides=True, mirrors=False)
     dr.eval(bounced)
     shown = batch.unpad([*visibility, *bounced], inputs.means.x)
-    return shown[: len(visibility)], shown[len(visibility) :], emitters if config.mirrors else []
+    return shown[: len(visibility)], shown[len(visibility) :], emitted if config.mirrors else []
 
 
 @recorded
@@ -293,11 +294,7 @@ def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
         inputs.features,
         normals=config.field.features,
         albedos=config.albedos,
-        means=inputs.means,
-        log_scales=inputs.rotations_and_scales[1],
-        logit_opacities=inputs.logits,
         sun=towards_sun(inputs.sun.light_axes),
-        unit=dr.gather(ad.Float, inputs.training_frame, ad.UInt32(3)),
     )
 
 
@@ -306,27 +303,27 @@ def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch
     return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 6 if config.mirrors else 3)]
 
 
-def _emitters(
+def _emitted(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, visibility: list[Float], batch: PaddedBatch
 ) -> list[Float]:
-    """What `scattering` gives, or nothing. weights: of the field"""
-    if not config.bounce:
+    """What `emission` gives, or nothing. weights: of the field"""
+    surroundings = inputs.surroundings
+    if surroundings is None:
         return []
-    scatterers, count = _scatterers(config, inputs), config.bounce
-    chosen = choose(scatterers, visibility, count, batch)
+    scatterers, emitters = _scatterers(config, inputs), surroundings.emitters
     if config.mirrors:
-        light = _painted(config, weights, inputs, visibility, chosen.number, batch.count)
+        light = _painted(config, weights, inputs, visibility, emitters, batch.count)
     else:
-        light = albedo_radiance(scatterers, visibility, chosen.number, batch.count)
-    return scattering(scatterers, chosen, count, light, batch)
+        light = albedo_radiance(scatterers, visibility, emitters, batch.count)
+    return emission(scatterers, surroundings, config.bounce, light, batch.count)
 
 
 def _received(
-    config: LightConfig, inputs: ShadingInputs, emitters: list[Float], batch: PaddedBatch, sides: bool, mirrors: bool
+    config: LightConfig, inputs: ShadingInputs, emitted: list[Float], batch: PaddedBatch, sides: bool, mirrors: bool
 ) -> list[Float]:
-    """Six Floats [M], RGB, of `irradiance` with `sides`, then six of `mirroring` with `mirrors`; nothing without
-    emitters."""
-    if not emitters:
+    """Six Floats [M], RGB, of `irradiance` with `sides`, then six of `mirroring` with `mirrors`; nothing where nothing
+    is emitted."""
+    if not emitted or inputs.surroundings is None:
         return []
     scatterers = _scatterers(config, inputs)
     kinds = [irradiance(scatterers, batch)] if sides else []
@@ -334,7 +331,7 @@ def _received(
         assert inputs.camera is not None
         direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
         kinds.append(mirroring(scatterers, direction, batch))
-    return received(scatterers, emitters, config.bounce, batch, *kinds)
+    return gathered(inputs.surroundings, emitted, config.bounce, batch, *kinds)
 
 
 def _painted(

@@ -37,8 +37,8 @@ class Sunlight:
 
     visibility: Float | None  #: Float [N], what dims colours (4.17), or None of a model without shadows
     bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
-    #: of `bounce.scattering`, where surfaces mirror them, or nothing
-    emitters: list[Float] = field(default_factory=list)
+    #: of `bounce.emission`, where surfaces mirror it, or nothing
+    emitted: list[Float] = field(default_factory=list)
     mirrored: list[Float] = field(default_factory=list)  #: what is left of that, a share [N] in a list, or nothing
 
     def dimmed(self, share: Float, linear: bool) -> "Sunlight":
@@ -46,4 +46,4 @@ class Sunlight:
         visibility = share if self.visibility is None else self.visibility * share
         of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
         mirrored = [left * of_light for left in self.mirrored] or [of_light]
-        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitters, mirrored)
+        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitted, mirrored)

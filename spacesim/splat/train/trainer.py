@@ -27,6 +27,7 @@ from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO, SPECULAR
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
+from spacesim.splat.light.surroundings import Surfaces, are_due
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
@@ -113,6 +114,8 @@ class Trainer(TrainingLoop):
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)
+        if self.light:
+            self._look_around(self.light)
         rows = self.gaussians.rows()
         results = [self._forward_backward(rows, degree, index * count + i) for i in range(count)]
         del rows  # so that old ones go as new ones come
@@ -130,6 +133,11 @@ class Trainer(TrainingLoop):
         losses = [result.loss for result in results]
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
+    def _look_around(self, light: LightModel) -> None:
+        """For light that bounces, where Gaussians have come or gone, and now and then."""
+        if light.config.bounce and (light.held_surfaces is None or are_due(self.iteration)):
+            light.hold_surroundings(self.gaussians)
+
     def _turn_discs(self) -> None:
         """Now and then, where light has learned their normals, which without shadows stand in for these, too."""
         light, is_due = self.config.light, self.iteration <= LAST and self.iteration % EVERY == 0
@@ -142,6 +150,8 @@ class Trainer(TrainingLoop):
         self._refine_gaussians()
         if self.gaussians.logit_opacities.index != before.index:
             self._view_pass.lists.after_refinement()
+            if self.light:
+                self.light.hold_surroundings(None)
 
     def _refine_gaussians(self) -> None:
         warm, done = self.warm_start, self.iteration
@@ -255,6 +265,9 @@ class Trainer(TrainingLoop):
                 tensors |= {f"{name}.{order}.{i:02d}": moment for i, moment in enumerate(moments)}
         tensors |= self.pictures.tensors()
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
+        held = self.light.held_surfaces if self.light else None
+        if held is not None:
+            tensors |= {f"surfaces.{name}": values for name, values in held.tensors().items()}
         if self.warm_start and self._warming(self.iteration):
             tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
         return tensors
@@ -278,6 +291,12 @@ class Trainer(TrainingLoop):
         optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
         _restore_moments(optimizer, tensors, "adam")
         _restore_moments(light_optimizer, tensors, "adam.light")
+        if light and "surfaces.means" in tensors:
+            named = {name.removeprefix("surfaces."): tensors[name] for name in tensors if name.startswith("surfaces.")}
+            held = Surfaces.from_tensors(named)
+            if len(held.means) != gaussians.count:
+                raise ValueError(f"surfaces.means: expected {gaussians.count}, found {len(held.means)}")
+            light.hold_surroundings(held)
         self.pictures.restore(tensors)
         state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
         warming = self.warm_start is not None and self._warming(header.iteration)

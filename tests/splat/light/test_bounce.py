@@ -11,21 +11,21 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
-from spacesim.splat.light.bounce import OVERLAP
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import FieldConfig, SurfaceConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
+from spacesim.splat.light.surroundings import EDGE
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.train.config import PRESETS, preset
+from spacesim.splat.train.config import PRESETS, preset, with_options
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
 
 NONE = Encoding("harmonics", 0)
 FIELD = FieldConfig(features=2, width=4, layers=2, inputs=SurfaceConfig())
-GLOW = LightConfig(FIELD, bounce=4000)
+GLOW = LightConfig(FIELD, bounce=4096)  # 512 rays
 SIDE = 40  #: Gaussians on a side of a square wall
 
 
@@ -34,10 +34,10 @@ def numbers(plane) -> np.ndarray:
 
 
 def discs(places: np.ndarray, normals: np.ndarray, spacing: float, albedo: float) -> dict[str, np.ndarray]:
-    """Thin opaque Gaussians about `places` [N, 3], across `normals` [N, 3], whose area 2 pi s^2 times `OVERLAP` and
-    opacity is that of a square of `spacing`."""
+    """Thin opaque Gaussians about `places` [N, 3], across `normals` [N, 3], whose discs just cover squares of
+    `spacing`."""
     opacity = 1 / (1 + np.exp(-6))
-    scale = spacing / np.sqrt(2 * np.pi * OVERLAP * opacity)
+    scale = 0.8 * spacing / np.sqrt(2 * np.log(opacity / EDGE))
     logit = np.log(albedo / (1 - albedo))
     turns = [Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat(scalar_first=True) for normal in normals]
     count = len(places)
@@ -81,16 +81,31 @@ def form_factor(height: float, half: float) -> float:
     return 4 * (x / root * np.arctan(x / root)) / np.pi
 
 
-@pytest.mark.parametrize("height", [0.3, 1.0, 3.0])
-def test_a_wall_lights_what_faces_it_as_its_form_factor_says(height):
+@pytest.mark.parametrize(("height", "within"), [(0.3, 0.02), (1.0, 0.03), (2.0, 0.07)])
+def test_a_wall_lights_what_faces_it_as_its_form_factor_says(height, within):
+    """But for the solid angles of rays at its edges."""
     splats = wall_and_receiver([0, 0, height], [0, 0, -1])
-    config = replace(GLOW, bounce=splats.count)
-    light = model(config).sunlight(splats, np.array([0.0, 0, 1]))
+    light = model().sunlight(splats, np.array([0.0, 0, 1]))
     assert light.visibility is None
     found = np.array([numbers(row)[-1] for row in light.bounced])
     expected = 0.5 * form_factor(height, 1.0)  # albedo, the Sun straight above
-    np.testing.assert_allclose(found[:3], expected, rtol=0.02)
+    np.testing.assert_allclose(found[:3], expected, rtol=within)
     np.testing.assert_allclose(found[3:], 0, atol=1e-6)  # its other side sees black sky
+
+
+def test_what_stands_between_hides_light():
+    """A black square half as far away as the wall, which covers all of it, then a quarter of it."""
+    whole = wall_and_receiver([0, 0, 0.8], [0, 0, -1])
+    spacing, up = 1.0 / SIDE, np.array([0.0, 0, 1])
+    shares = []
+    for middle in ((0.0, 0.0), (0.55, 0.55)):
+        places = np.column_stack([square(1.1 * spacing) + middle, np.full(SIDE * SIDE, 0.4)])
+        between = discs(places, np.tile([0.0, 0, 1], (len(places), 1)), 1.1 * spacing, 1e-6)
+        parts = {name: np.concatenate([between[name], values]) for name, values in whole.to_numpy().items()}
+        light = [model().sunlight(one, up).bounced[0] for one in (whole, Gaussians.from_numpy(parts))]
+        shares.append(numbers(light[1])[-1] / numbers(light[0])[-1])
+    assert shares[0] < 0.02
+    assert shares[1] == pytest.approx(0.75, abs=0.06)
 
 
 def test_light_goes_with_the_cosine_of_the_sun_and_a_sample_is_as_bright_as_all():
@@ -120,11 +135,12 @@ def test_what_lies_in_shadow_scatters_nothing():
         numbers(lit.sunlight(joined(*parts, *more, receiver), up).bounced[0])[-1] for more in ([], [black])
     )
     assert free > 0.1
-    assert covered < 0.05 * free
+    assert covered < 0.1 * free
 
 
 @pytest.mark.parametrize("gloss", [False, True])
-def test_turning_all_together_changes_nothing(gloss):
+def test_turning_all_together_changes_little(gloss):
+    """The rays do not turn with it."""
     splats, light = wall_and_receiver([0.3, -0.2, 0.6], [0.3, 0.1, -0.9]), model()
     if gloss:
         splats, light = shining(splats, 0.2)
@@ -137,9 +153,8 @@ def test_turning_all_together_changes_nothing(gloss):
     arrays["features"][:, 2:5] = turn.apply(arrays["features"][:, 2:5])
     sun = np.array([0.48, -0.36, 0.8])
     one, other = light.sunlight(splats, sun), light.sunlight(Gaussians.from_numpy(arrays), turn.apply(sun))
-    np.testing.assert_allclose(
-        [numbers(row) for row in one.bounced], [numbers(row) for row in other.bounced], atol=2e-5
-    )
+    rows = [[numbers(row) for row in light.bounced] for light in (one, other)]
+    np.testing.assert_allclose(*rows, rtol=0.02, atol=1e-4)
 
 
 def test_a_picture_is_brighter_by_what_arrives_at_the_side_that_is_seen():
@@ -170,7 +185,7 @@ def shining(splats: Gaussians, specular: float, **more) -> tuple[Gaussians, Ligh
     arrays = splats.to_numpy()
     logit = np.full((splats.count, 3), np.log(specular / (1 - specular)))
     arrays["features"] = np.column_stack([arrays["features"], logit])
-    light = model(LightConfig(FIELD, bounce=splats.count, gloss=True, linear=True, **more))
+    light = model(LightConfig(FIELD, bounce=GLOW.bounce, gloss=True, linear=True, **more))
     light.weights = [ad.Float(0) * weight for weight in light.weights]
     light.weights[-1] = ad.Float([np.log(0.6 / 0.4)] * 3)
     return Gaussians.from_numpy(arrays), light
@@ -225,7 +240,7 @@ def test_a_glossy_surface_mirrors_most_at_grazing_angles():
 
     expected = mirrored(np.array([0.0, 0, 1]), view, 0.04, is_wall)
     assert expected > 3 * 0.04
-    assert found == pytest.approx(0.6 * expected, rel=0.05)
+    assert found == pytest.approx(0.6 * expected, rel=0.1)
 
 
 @pytest.mark.parametrize("linear", [True, False])
@@ -292,7 +307,7 @@ def test_odd_models_stay_finite(change, gloss):
 
 
 def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_path):
-    config = replace(preset("demo", "shadow-splat"), iterations=30, init_count=300)
+    config = with_options(preset("demo", "shadow-splat"), iterations=150, init_count=300)
     assert config.light.bounce > 0
     runs = [train(small_lit_dataset, tmp_path / name, config) for name in ("one", "two")]
     assert len({(run.path / "model.safetensors").read_bytes() for run in runs}) == 1
@@ -313,7 +328,7 @@ def test_training_learns_albedos_and_repeats_to_the_bit(small_lit_dataset, tmp_p
 
 @pytest.mark.parametrize("emitters", [2000, 1600, 400])
 def test_one_that_is_not_a_number_lights_nobody(emitters):
-    """A receiver over a wall, some of which is broken: as bright as before, less these."""
+    """A receiver over a wall, one of which is broken: as bright as before, less that."""
     splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
     light, up = model(replace(GLOW, bounce=emitters)), np.array([0.0, 0, 1])
     before = numbers(light.sunlight(splats, up).bounced[0])[-1]
@@ -321,37 +336,25 @@ def test_one_that_is_not_a_number_lights_nobody(emitters):
         arrays = splats.to_numpy()
         arrays[name][800] = value
         found = numbers(light.sunlight(Gaussians.from_numpy(arrays), up).bounced[0])[-1]
-        assert found == pytest.approx(before, rel=0.01), name
+        assert found == pytest.approx(before, rel=0.02), name
 
 
 @pytest.mark.parametrize("emitters", [100, 400])
-def test_a_vast_one_is_not_all_emitters(emitters):
-    """It lights as one vast disc does, if it is chosen, and the rest of the wall as before."""
+def test_a_vast_one_hides_nothing(emitters):
+    """What is larger than the model is no surface of it."""
     splats = wall_and_receiver([0, 0, 0.5], [0, 0, -1])
     arrays, up = splats.to_numpy(), np.array([0.0, 0, 1])
-    for size in (8, 15):
-        arrays["log_scales"][800, :2] = size
-        vast = Gaussians.from_numpy(arrays)
-        every, some = (
-            numbers(model(replace(GLOW, bounce=count)).sunlight(vast, up).bounced[0])[-1]
-            for count in (splats.count, emitters)
-        )
-        assert some == pytest.approx(every, rel=0.3), size
+    before, *others = (
+        numbers(model(replace(GLOW, bounce=emitters)).sunlight(Gaussians.from_numpy(each), up).bounced[0])[-1]
+        for each in (arrays, vast(arrays, 8), vast(arrays, 15))
+    )
+    assert others == pytest.approx([before, before], rel=0.02)
 
 
-def test_emitters_stay_as_the_sun_turns():
-    """By a tenth of a degree: the light changes by as little as that of all would, not by other emitters."""
-    rng = np.random.default_rng(3)
-    places, albedo = 2 * rng.uniform(size=(900, 3)) - 1, 0.5
-    turns = rng.normal(size=(900, 3))
-    cloud = Gaussians.from_numpy(discs(places, turns / np.linalg.norm(turns, axis=1, keepdims=True), 0.1, albedo))
-    light = model(replace(GLOW, bounce=200))
-    rows = []
-    for angle in (0.7, 0.7 + np.radians(0.1)):
-        sun = np.array([np.sin(angle), 0.1, np.cos(angle)])
-        rows.append(np.array([numbers(row) for row in light.sunlight(cloud, sun / np.linalg.norm(sun)).bounced]))
-    change = np.sqrt(((rows[1] - rows[0]) ** 2).mean() / (rows[0] ** 2).mean())
-    assert change < 0.1, "the running sum of all would change by more than half"
+def vast(arrays: dict[str, np.ndarray], size: float) -> dict[str, np.ndarray]:
+    log_scales = arrays["log_scales"].copy()
+    log_scales[800, :2] = size
+    return {**arrays, "log_scales": log_scales}
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -1,0 +1,144 @@
+"""What Gaussians see around them, against rays in float64, and training that goes on from a checkpoint."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
+from spacesim.splat.light.surroundings import (
+    AWAY,
+    EDGE,
+    FARTHEST,
+    LEAST_RAYS,
+    MOST_RAYS,
+    OPAQUE,
+    SKY,
+    Surfaces,
+    Surroundings,
+    look_around,
+    ray_count,
+)
+from spacesim.splat.train.config import preset, with_options
+from spacesim.splat.train.trainer import Trainer
+
+RADIUS = 2.0  #: of the models here
+
+
+def surfaces(count: int, seed: int = 0, size: float = 0.2) -> Surfaces:
+    """Discs of all directions in a ball of 1 m, some of which let light through."""
+    rng = np.random.default_rng(seed)
+    arrays = {
+        "means": rng.uniform(-0.6, 0.6, (count, 3)),
+        "log_scales": np.log(size * rng.uniform(0.3, 1, (count, 3)) * [1, 1, 1e-4]),
+        "quaternions": rng.normal(size=(count, 4)),
+        "logit_opacities": rng.uniform(-2, 4, count),
+        "normals": rng.normal(size=(count, 3)),
+    }
+    return Surfaces(**{name: np.float32(values) for name, values in arrays.items()})
+
+
+def seen_along(surroundings: Surroundings, count: int) -> np.ndarray:
+    """[R, N] of `Surroundings.seen`, ray by ray."""
+    words = np.array(surroundings.seen).reshape(-1, count)
+    return np.stack([words & 0xFFFF, words >> 16], axis=1).reshape(-1, count).astype(int)
+
+
+def first_met(of: Surfaces, towards: np.ndarray) -> np.ndarray:
+    """[N] the first disc that a ray from each Gaussian meets, -1 for none: one pair after another."""
+    opacity, scales = 1 / (1 + np.exp(-of.logit_opacities.astype(float))), np.exp(of.log_scales.astype(float))
+    axes, reach = rotation_from_quaternion(of.quaternions), np.sqrt(2 * np.log(np.maximum(opacity, OPAQUE) / EDGE))
+    normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
+    two = np.sort(scales, axis=1)[:, 1:]
+    away = np.minimum(AWAY * np.sqrt(two.prod(axis=1)), FARTHEST * RADIUS)
+    start = of.means + (away * np.where(normals @ towards < 0, -1, 1))[:, None] * normals
+    nearest, met = np.full(len(start), np.inf), np.full(len(start), -1)
+    for k in np.flatnonzero(opacity > OPAQUE):
+        across = axes[k][:, scales[k].argmin()]
+        distance = ((of.means[k] - start) @ across) / (towards @ across)
+        place = (start + distance[:, None] * towards - of.means[k]) @ axes[k]
+        in_plane = np.delete(np.arange(3), scales[k].argmin())
+        inside = ((place[:, in_plane] / (reach[k] * scales[k][in_plane])) ** 2).sum(axis=1) < 1
+        closer = inside & (distance > 0) & (distance < nearest)
+        nearest[closer], met[closer] = distance[closer], k
+    return met
+
+
+def test_rays_meet_what_they_meet_in_float64():
+    """Polygons of their area stand for discs: a few rays pass one's edge and not the other's."""
+    of, count = surfaces(150), 150
+    surroundings = look_around(of, 200, RADIUS)
+    found, directions = seen_along(surroundings, count), fibonacci_sphere(ray_count(200))
+    emitters = np.append(np.array(surroundings.emitters), -np.ones(0x8000)).astype(int)
+    normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
+    same, sides, hits = [], [], 0
+    for towards, sides_met in zip(directions, found, strict=True):
+        met = emitters[sides_met // 2]
+        expected = first_met(of, towards)
+        same.append((met == expected).mean())
+        both = (met == expected) & (met >= 0)
+        sides.extend((sides_met % 2 == (normals[met] @ towards > 0))[both])
+        hits += (met >= 0).sum()
+    assert 0.2 < hits / found.size < 0.9
+    assert np.mean(same) > 0.95
+    assert np.mean(sides) > 0.999
+
+
+def test_few_emitters_stand_for_what_is_near():
+    """The same rays meet the same; one of 200 stands for each of 900."""
+    of, few = surfaces(900, size=0.1), 200
+    every, some = (look_around(of, emitters, RADIUS) for emitters in (1000, few))
+    assert ray_count(1000) == ray_count(few)
+    numbers = np.array(some.emitters)
+    assert numbers.shape == (few,)
+    assert len(np.unique(numbers)) > 0.9 * few
+    met, stands = (seen_along(one, 900) for one in (every, some))
+    assert ((met == SKY) == (stands == SKY)).all()
+    hit = met != SKY
+    met, stands = np.array(every.emitters)[met[hit] // 2], numbers[stands[hit] // 2]
+    away = np.linalg.norm(of.means[met] - of.means[stands], axis=1)
+    assert np.median(away) < 0.4
+    normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
+    assert np.mean((normals[met] * normals[stands]).sum(axis=1)) > 0.2
+
+
+@pytest.mark.parametrize("emitters", [1, 7, 1024, 1040, 2**14])
+def test_rays_are_even_in_number(emitters):
+    assert ray_count(emitters) % 2 == 0
+    assert LEAST_RAYS <= ray_count(emitters) <= MOST_RAYS
+
+
+def test_the_same_gaussians_see_the_same_to_the_bit():
+    one, other = (look_around(surfaces(500), 100, RADIUS) for _ in range(2))
+    np.testing.assert_array_equal(np.array(one.seen), np.array(other.seen))
+    np.testing.assert_array_equal(np.array(one.emitters), np.array(other.emitters))
+
+
+def test_surfaces_of_a_checkpoint_are_checked():
+    tensors = surfaces(5).tensors()
+    for name, values in Surfaces.from_tensors(tensors).tensors().items():
+        np.testing.assert_array_equal(values, tensors[name])
+    with pytest.raises(ValueError, match="normals: expected 5"):
+        Surfaces.from_tensors({**tensors, "normals": tensors["normals"][:4]})
+    with pytest.raises(KeyError):
+        Surfaces.from_tensors({name: values for name, values in tensors.items() if name != "quaternions"})
+
+
+def test_training_goes_on_to_the_bit_between_two_looks_around(small_lit_dataset, tmp_path):
+    """Rays are traced anew after 50 and 100 steps and where Gaussians come or go; checkpoints fall in between."""
+    config = with_options(preset("demo", "shadow-map"), iterations=130, init_count=200)
+    config = replace(config, refinement=replace(config.refinement, refine_every=40, refine_start=30, refine_stop=110))
+    straight, stops, counts = Trainer(small_lit_dataset, config), (45, 80, 97), set()
+    while straight.iteration < 125:
+        straight.step()
+        counts.add(straight.gaussians.count)
+        if straight.iteration in stops:
+            straight.save(tmp_path / f"at_{straight.iteration}")
+    assert len(counts) > 1, "no Gaussian has come or gone"
+    for stop in stops:
+        resumed = Trainer(small_lit_dataset, config)
+        resumed.restore(tmp_path / f"at_{stop}")
+        while resumed.iteration < 125:
+            resumed.step()
+        for name, value in straight.gaussians.to_numpy().items():
+            np.testing.assert_array_equal(value, resumed.gaussians.to_numpy()[name], err_msg=f"{name} from {stop}")
