@@ -38,17 +38,18 @@ class DiscGrid:
     @staticmethod
     def of(centers: Array, axes: Array) -> "DiscGrid":
         """centers: [n, 3] metres;  axes: [n, 2, 3] metres, at right angles, the semi-axes, above 0 all"""
-        half = np.sqrt((axes**2).sum(axis=1))
+        squares = np.einsum("nij,nij->ni", axes, axes)
+        half = np.sqrt(axes[:, 0] ** 2 + axes[:, 1] ** 2)
         low, high = (centers - half).min(axis=0), (centers + half).max(axis=0)
         size = float((high - low).max())
-        cell = max(CELL * float(np.median(np.linalg.norm(axes, axis=2).max(axis=1))), size / MOST_CELLS, 1e-9)
-        while (boxes := _cells(centers - low, half, cell))[1].prod(axis=1).sum() > MOST_ENTRIES:
+        longer = np.sqrt(np.maximum(squares[:, 0], squares[:, 1]))
+        cell = max(CELL * float(np.median(longer)), size / MOST_CELLS, 1e-9)
+        while _products((boxes := _cells(centers - low, half, cell))[1]).sum() > MOST_ENTRIES:
             cell *= 2
         columns = boxes[0].max(axis=0) + boxes[1].max(axis=0)
         discs, starts = _lists(*boxes, columns)
-        scaled = axes / (axes**2).sum(axis=2, keepdims=True)
-        normals = np.cross(scaled[:, 0], scaled[:, 1])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        scaled, normals = axes / squares[:, :, None], np.cross(axes[:, 0], axes[:, 1])
+        normals /= np.sqrt(squares[:, 0] * squares[:, 1])[:, None]
         index = dr.arange(ad.UInt32, len(centers))
         columns_of = [upload(row) for row in np.hstack([centers, normals, scaled.reshape(-1, 6)]).T]
         records = [store(values, index, len(centers)) for values in packets(columns_of)]
@@ -129,7 +130,7 @@ def _cells(centers: Array, half: Array, cell: float) -> tuple[NDArray[np.int64],
 def _lists(first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[np.int64]) -> tuple[UInt32, UInt32]:
     """(discs cell by cell, in a cell in any order, where each cell's start and the last one's end) of boxes of cells,
     see `_cells`. columns: cells along each axis"""
-    counts = sides.prod(axis=1)
+    counts = _products(sides)
     before = np.cumsum(counts) - counts
     disc = upload(np.repeat(np.arange(len(first)), counts), ad.UInt32)
     number = dr.arange(ad.UInt32, dr.width(disc)) - dr.gather(ad.UInt32, upload(before, ad.UInt32), disc)
@@ -147,6 +148,10 @@ def _lists(first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[
     dr.scatter(discs, disc, dr.gather(ad.UInt32, starts, cell) + place)
     dr.eval(discs)
     return discs, starts
+
+
+def _products(sides: NDArray[np.int64]) -> NDArray[np.int64]:
+    return sides[:, 0] * sides[:, 1] * sides[:, 2]
 
 
 def _opaque(columns: NDArray[np.int64]) -> tuple[UInt32, UInt32, UInt32]:

@@ -122,15 +122,20 @@ class _Discs:
     @staticmethod
     def of(surfaces: Surfaces, radius: float) -> "_Discs":
         opacity, scales = _opacities(surfaces), np.maximum(_scales(surfaces), LEAST_SCALE * radius)
-        with np.errstate(over="ignore", invalid="ignore"):
-            semi_axes = scales * np.sqrt(2 * np.log(np.maximum(opacity, OPAQUE) / EDGE))[:, None]
-            lengths = np.linalg.norm(surfaces.quaternions.astype(np.float64), axis=1)
-        keep = (opacity > OPAQUE) & (lengths > 0) & np.isfinite(lengths) & (semi_axes.max(axis=1) < radius)
-        keep &= (np.abs(surfaces.means) < FARTHEST_DISC * radius).all(axis=1)
+        reach = np.sqrt(2 * np.log(np.maximum(opacity, OPAQUE) / EDGE))
+        x, y, z = scales.T
+        length2 = np.einsum("ni,ni->n", surfaces.quaternions, surfaces.quaternions, dtype=np.float64)
+        keep = (opacity > OPAQUE) & (length2 > 0) & np.isfinite(length2)
+        keep &= np.maximum(np.maximum(x, y), z) * reach < radius
+        for column in surfaces.means.T:
+            keep &= np.abs(column) < FARTHEST_DISC * radius
         numbers = np.flatnonzero(keep).astype(np.uint32)
-        longer = np.argsort(scales[numbers], axis=1, kind="stable")[:, 1:, None]
-        columns = np.swapaxes(rotation_from_quaternion(surfaces.quaternions[numbers]), 1, 2)
-        axes = np.take_along_axis(columns * semi_axes[numbers, :, None], longer, axis=1)
+        shortest = scales[numbers].argmin(axis=1)
+        turns, place = rotation_from_quaternion(surfaces.quaternions[numbers]), np.arange(len(numbers))
+        axes = np.empty((len(numbers), 2, 3))
+        for i in range(2):
+            longer = i + (shortest <= i)
+            axes[:, i] = turns[place, :, longer] * (scales[numbers, longer] * reach[numbers])[:, None]
         return _Discs(numbers, surfaces.means[numbers].astype(np.float64), axes)
 
 
