@@ -195,7 +195,7 @@ class LightModel:
 
     def surroundings(self, gaussians: Gaussians) -> Surroundings | None:
         """What these see around them, or saw at the last `hold_surroundings`; None for a model without a bounce."""
-        if not self.config.bounce:
+        if not self.config.bounce or gaussians.count == 0:
             return None
         read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
         if self._held is None and not _are_same(read, self._around.read):
