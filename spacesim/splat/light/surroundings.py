@@ -30,7 +30,7 @@ EDGE = 0.3  #: where its opacity has fallen to this, a Gaussian ends for rays
 AWAY = 4.0  #: standard deviations of a Gaussian from which its rays start, along its normal: over its neighbours
 FARTHEST = 0.05  #: of the model's radius: they start no farther away than this
 LEAST_SCALE = 1e-5  #: of the model's radius: no disc is smaller
-FARTHEST_DISC = 4.0  #: of the model's radius: what is farther away is no part of it
+FARTHEST_DISC = 4.0  #: of the model's radius: what is farther away from its middle is no part of it
 CHOSEN = 0.1  #: of the model's radius: a Gaussian counts no more for the choice of emitters than one of this size
 NORMALS_APART = 0.05  #: of the model's radius: how much a normal counts beside a place where the nearest is sought
 CELLS = 1 << 10  #: on a side of the model, along whose curve emitters are chosen
@@ -127,8 +127,8 @@ class _Discs:
         length2 = np.einsum("ni,ni->n", surfaces.quaternions, surfaces.quaternions, dtype=np.float64)
         keep = (opacity > OPAQUE) & (length2 > 0) & np.isfinite(length2)
         keep &= np.maximum(np.maximum(x, y), z) * reach < radius
-        for column in surfaces.means.T:
-            keep &= np.abs(column) < FARTHEST_DISC * radius
+        for column, middle in zip(surfaces.means.T, _middle(surfaces), strict=True):
+            keep &= np.abs(column - middle) < FARTHEST_DISC * radius
         numbers = np.flatnonzero(keep).astype(np.uint32)
         shortest = scales[numbers].argmin(axis=1)
         turns, place = rotation_from_quaternion(surfaces.quaternions[numbers]), np.arange(len(numbers))
@@ -206,12 +206,18 @@ def _choose(
 def _along_curve(surfaces: Surfaces, radius: float) -> NDArray[np.int64]:
     """[N] places of the Gaussians along a curve through all cells of a cube (Morton 1966): near ones are mostly near on
     it."""
-    means = np.nan_to_num(surfaces.means.astype(np.float64), posinf=0, neginf=0)
-    low = np.median(means, axis=0) - 2 * radius
-    spread = np.clip((means - low) * (CELLS / (4 * radius)), 0, CELLS - 1).astype(np.int64)
+    low = _middle(surfaces) - 2 * radius
+    cells = (surfaces.means - low) * (CELLS / (4 * radius))
+    spread = np.clip(np.nan_to_num(cells, posinf=0, neginf=0), 0, CELLS - 1).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         spread = (spread | spread << shift) & mask
     return spread[:, 0] | spread[:, 1] << 1 | spread[:, 2] << 2
+
+
+def _middle(surfaces: Surfaces) -> Array:
+    """[3] metres: the median of the places that are numbers."""
+    means = surfaces.means[np.isfinite(surfaces.means).all(axis=1)].astype(np.float64)
+    return np.median(means, axis=0) if len(means) else np.zeros(3)
 
 
 def _scales(surfaces: Surfaces) -> Array:

@@ -114,6 +114,14 @@ def test_the_same_gaussians_see_the_same_to_the_bit():
     np.testing.assert_array_equal(np.array(one.emitters), np.array(other.emitters))
 
 
+def test_where_the_world_begins_makes_no_difference():
+    of = surfaces(300)
+    moved = replace(of, means=of.means + np.float32([64, -512, 32]))
+    near, far = (seen_along(look_around(one, 400, RADIUS), 300) for one in (of, moved))
+    assert (near != SKY).mean() > 0.2
+    assert (near == far).mean() > 0.99, "but for rounding"
+
+
 def test_surfaces_of_a_checkpoint_are_checked():
     tensors = surfaces(5).tensors()
     for name, values in Surfaces.from_tensors(tensors).tensors().items():
