@@ -5,6 +5,7 @@
 as given, and so do shadows, as in the literature, unless `ShadowConfig.gradients` takes them back to the Gaussians.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -28,12 +29,15 @@ from spacesim.splat.light.shading import ShadingInputs, ShadingTape, split_weigh
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
-from spacesim.splat.light.surroundings import Surfaces, Surroundings, look_around
+from spacesim.splat.light.surroundings import Surfaces, Surroundings, look_around, ray_count
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
 
+log = logging.getLogger(__name__)
+
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
+MANY_RAYS = 1e7  #: which take seconds on a CPU
 GEOMETRY = 11  #: rows of Gaussians that say where they are, how large, how turned and how opaque
 COOPERATIVE = ("cuda",)  #: backends on which the field of pictures is computed by `cooperative` where that works
 
@@ -200,6 +204,9 @@ class LightModel:
         read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
         if self._held is None and not _are_same(read, self._around.read):
             self._around = _Around([], None)  # frees memory for the next
+            rays = gaussians.count * ray_count(self.config.bounce)
+            if select() == "llvm" and rays > MANY_RAYS:
+                log.info("light that bounces: %.0f million rays are traced, once for all pictures", rays / 1e6)
             self._around = _Around(_kept(read), self._look_around(self._surfaces(gaussians)))
         return self._around.surroundings
 

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
+from spacesim.splat.light import model as light_module
+from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.field import FieldConfig, SurfaceConfig
+from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.surroundings import (
     AWAY,
     EDGE,
@@ -19,6 +23,7 @@ from spacesim.splat.light.surroundings import (
     look_around,
     ray_count,
 )
+from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import preset, with_options
 from spacesim.splat.train.trainer import Trainer
 
@@ -120,6 +125,22 @@ def test_where_the_world_begins_makes_no_difference():
     near, far = (seen_along(look_around(one, 400, RADIUS), 300) for one in (of, moved))
     assert (near != SKY).mean() > 0.2
     assert (near == far).mean() > 0.99, "but for rounding"
+
+
+def test_what_takes_seconds_says_so_once(monkeypatch, caplog):
+    config = LightConfig(FieldConfig(features=2, width=4, layers=2, inputs=SurfaceConfig()), bounce=50)
+    light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 5.0, RADIUS), 0)
+    arrays = surfaces(20).tensors()
+    features = np.column_stack([np.zeros((20, 2)), arrays.pop("normals"), np.zeros((20, 3))])
+    splats = Gaussians.from_numpy({**arrays, "sh": np.zeros((20, 0, 3)), "features": features})
+    monkeypatch.setattr(light_module, "MANY_RAYS", 20 * LEAST_RAYS - 1)
+    monkeypatch.setattr(light_module, "select", lambda: "llvm")
+    with caplog.at_level("INFO"):
+        for sun in np.eye(3):
+            light.sunlight(splats, sun)
+    assert [record.message for record in caplog.records].count(
+        "light that bounces: 0 million rays are traced, once for all pictures"
+    ) == 1
 
 
 def test_surfaces_of_a_checkpoint_are_checked():
