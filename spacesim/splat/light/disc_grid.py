@@ -1,7 +1,7 @@
 """Discs in the cells of a grid, and the first that a ray meets (Amanatides and Woo 1987).
 
-A ray tracer's hierarchy, as OptiX builds it, answers differently from run to run where two discs are equally far, as
-those in one plane are. Here the one of the lower number is met, so that training repeats to the bit.
+Of two discs equally far, as those in one plane are, a ray tracer's hierarchy may give either: OptiX promises nothing.
+Here the one of the lower number is met, so that training repeats to the bit, with OptiX or without.
 """
 
 from dataclasses import dataclass
