@@ -213,10 +213,12 @@ class LightModel:
     def hold_surroundings(self, of: Gaussians | Surfaces | None) -> None:
         """In training Gaussians move in each step: light bounces as if they stood where these do, as many as they are,
         until this is called again. None: where they stand"""
-        self._held = self._surfaces(of) if isinstance(of, Gaussians) else of
-        self._around = _Around([], None)
-        if self._held is not None:
-            self._around = _Around([], self._look_around(self._held))
+        held = self._surfaces(of) if isinstance(of, Gaussians) else of
+        self._held, self._around = None, _Around([], None)
+        self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # its emitters have other numbers
+        if held is not None:
+            self._around = _Around([], self._look_around(held))
+            self._held = held
 
     @property
     def held_surfaces(self) -> Surfaces | None:
