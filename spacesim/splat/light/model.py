@@ -192,7 +192,7 @@ class LightModel:
         shadows = self.shadows(gaussians, sun, make_lists)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
         terms = self._with_embedding(self.encode_sun(sun, earth), embedding)
-        inputs = self._inputs(gaussians, camera, terms, shadows)
+        inputs = self._inputs(gaussians, camera, terms, shadows, self.surroundings(gaussians))
         batch = PaddedBatch.of(gaussians.count)
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
@@ -251,7 +251,7 @@ class LightModel:
         batch = PaddedBatch.of(gaussians.count, still=True)
         of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun), of_picture)
-        inputs = self._inputs(gaussians, None, terms, shadows)
+        inputs = self._inputs(gaussians, None, terms, shadows, self.surroundings(gaussians))
         visibility, bounced, emitted = kernels.cast_sunlight(self.config, self.weights, inputs, batch)
         return Sunlight(visibility[0] if visibility else None, bounced, emitted)
 
@@ -274,7 +274,8 @@ class LightModel:
         cache = self._picture_cache(_features(gaussians), batch)
         of_picture = cache.embedding if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun, earth), of_picture)
-        inputs = self._inputs(gaussians, of_any_size, terms, None)
+        around = self.surroundings(gaussians) if light.emitted else None  # what is not read is not traced
+        inputs = self._inputs(gaussians, of_any_size, terms, None, around)
         of_field, _ = split_weights(self.config, self.weights)
         shown = kernels.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
         return shown[:3], None if light.visibility is None else shown[3]
@@ -356,7 +357,12 @@ class LightModel:
         return dr.opaque(ad.UInt32, picture * size) + dr.arange(ad.UInt32, size)
 
     def _inputs(
-        self, gaussians: Gaussians, camera: Projection | None, sun: SunEncoding, shadows: Shadows | None
+        self,
+        gaussians: Gaussians,
+        camera: Projection | None,
+        sun: SunEncoding,
+        shadows: Shadows | None,
+        surroundings: Surroundings | None,
     ) -> ShadingInputs:
         raw_shadows = [shadows.occlusion, *shadows.info] if shadows else []
         rotations_and_scales = gaussians.quaternions, gaussians.log_scales
@@ -370,7 +376,7 @@ class LightModel:
             raw_shadows,
             sun,
             self._training_frame,
-            self.surroundings(gaussians),
+            surroundings,
         )
 
     def _picture_cache(self, features: Float, batch: PaddedBatch) -> _PictureCache:

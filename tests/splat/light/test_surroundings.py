@@ -70,7 +70,6 @@ def first_met(of: Surfaces, towards: np.ndarray) -> np.ndarray:
 
 
 def test_rays_meet_what_they_meet_in_float64():
-    """Polygons of their area stand for discs: a few rays pass one's edge and not the other's."""
     of, count = surfaces(150), 150
     surroundings = look_around(of, 200, RADIUS)
     found, directions = seen_along(surroundings, count), fibonacci_sphere(ray_count(200))
