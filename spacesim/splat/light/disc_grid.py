@@ -21,13 +21,15 @@ MISSED = 0xFFFFFFFF  #: in place of a disc's number
 MOST_CELLS = 160  #: along the longest side
 CELL = 1.5  #: median radii of a disc
 MOST_ENTRIES = 1 << 25  #: of discs in cells; larger cells have fewer
+ROUNDING = 1e-3  #: of a cell
 FAR = 1e30  #: metres, no ray gets there
 
 
 @dataclass
 class DiscGrid:
-    """n ellipses in space."""
+    """Ellipses in space."""
 
+    count: int  #: n of them
     records: list[Float]  #: centre, normal, and what gives places in units of the semi-axes, see `records.load`
     discs: UInt32  #: cell by cell, in a cell in any order
     starts: UInt32  #: where those of each cell start, and the end
@@ -47,13 +49,14 @@ class DiscGrid:
         while _products((boxes := _cells(centers - low, half, cell))[1]).sum() > MOST_ENTRIES:
             cell *= 2
         columns = boxes[0].max(axis=0) + boxes[1].max(axis=0)
-        discs, starts = _lists(*boxes, columns)
         scaled, normals = axes / squares[:, :, None], np.cross(axes[:, 0], axes[:, 1])
         normals /= np.sqrt(squares[:, 0] * squares[:, 1])[:, None]
+        discs, starts = _lists(*boxes, columns, normals, np.einsum("ni,ni->n", normals, (centers - low) / cell))
         index = dr.arange(ad.UInt32, len(centers))
         columns_of = [upload(row) for row in np.hstack([centers, normals, scaled.reshape(-1, 6)]).T]
         records = [store(values, index, len(centers)) for values in packets(columns_of)]
         grid = DiscGrid(
+            len(centers),
             records,
             discs,
             starts,
@@ -64,9 +67,9 @@ class DiscGrid:
         dr.eval(grid)
         return grid
 
-    def first_met(self, count: int, start: Array3f, direction: Array3f, active: Bool) -> UInt32:
-        """[M] the nearest of the `count` discs along rays, of equally near ones the one of the lowest number; MISSED
-        for none. start: [3, M] metres;  direction: [3, M] unit"""
+    def first_met(self, start: Array3f, direction: Array3f, active: Bool) -> UInt32:
+        """[M] the nearest of the discs along rays, of equally near ones the one of the lowest number; MISSED for none.
+        start: [3, M] metres;  direction: [3, M] unit"""
         steep = dr.select(dr.abs(direction) < 1e-12, ad.Array3f(1e-12), direction)
         inverse, high = dr.rcp(steep), self.low + self.cell * ad.Array3f([ad.Float(n) for n in self.columns])
         crossings: list[Any] = [(self.low - start) * inverse, (high - start) * inverse]
@@ -91,7 +94,7 @@ class DiscGrid:
         ) -> tuple[Bool, list[Any], list[Float], UInt32, UInt32, Float, UInt32]:
             tests = going & (k < end)
             disc = dr.gather(ad.UInt32, self.discs, k, tests)
-            numbers = load(self.records, disc, count, tests)
+            numbers = load(self.records, disc, self.count, tests)
             center, normal, first, second = (ad.Array3f(numbers[i : i + 3]) for i in (0, 3, 6, 9))
             distance = dr.dot(center - start, normal) / dr.dot(direction, normal)
             off = start + distance * direction - center
@@ -127,9 +130,12 @@ def _cells(centers: Array, half: Array, cell: float) -> tuple[NDArray[np.int64],
     return first, ((centers + half) / cell).astype(np.int64) - first + 1
 
 
-def _lists(first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[np.int64]) -> tuple[UInt32, UInt32]:
-    """(discs cell by cell, in a cell in any order, where each cell's start and the last one's end) of boxes of cells,
-    see `_cells`. columns: cells along each axis"""
+def _lists(
+    first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[np.int64], normals: Array, offsets: Array
+) -> tuple[UInt32, UInt32]:
+    """(discs cell by cell, in a cell in any order, where each cell's start and the last one's end): of boxes of cells,
+    see `_cells`, those that the disc's plane n.x = d cuts. columns: cells along each axis;  normals: [n, 3], unit;
+    offsets: d, [n], in cells from the corner"""
     counts = _products(sides)
     before = np.cumsum(counts) - counts
     disc = upload(np.repeat(np.arange(len(first)), counts), ad.UInt32)
@@ -138,14 +144,19 @@ def _lists(first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[
     # no division by 0 in lanes beyond the last one, which run along
     wide, high, _ = (dr.maximum(dr.gather(ad.UInt32, upload(values, ad.UInt32), disc), 1) for values in sides.T)
     nx, ny, _ = _opaque(columns)
-    cell = ((z + number // wide // high) * ny + y + number // wide % high) * nx + x + number % wide
+    x, y, z = x + number % wide, y + number // wide % high, z + number // wide // high
+    a, b, c, d = (dr.gather(ad.Float, upload(values), disc) for values in (*normals.T, offsets))
+    middle: list[Float] = [ad.Float(number) + 0.5 for number in (x, y, z)]
+    away: Float = dr.abs(a * middle[0] + b * middle[1] + c * middle[2] - d)
+    is_cut = away < 0.5 * (dr.abs(a) + dr.abs(b) + dr.abs(c)) + ROUNDING
+    cell = (z * ny + y) * nx + x
     lengths = dr.opaque(ad.UInt32, 0, int(columns.prod()) + 1)
-    place = cast(UInt32, dr.scatter_inc(lengths, cell))
-    dr.eval(place, cell, lengths)
+    place = cast(UInt32, dr.scatter_inc(lengths, cell, is_cut))
+    dr.eval(place, cell, is_cut, lengths)
     starts = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=True)
     dr.eval(starts)
     discs = dr.opaque(ad.UInt32, 0, dr.width(disc))
-    dr.scatter(discs, disc, dr.gather(ad.UInt32, starts, cell) + place)
+    dr.scatter(discs, disc, dr.gather(ad.UInt32, starts, cell) + place, is_cut)
     dr.eval(discs)
     return discs, starts
 

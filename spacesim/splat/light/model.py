@@ -201,24 +201,24 @@ class LightModel:
         """What these see around them, or saw at the last `hold_surroundings`; None for a model without a bounce."""
         if not self.config.bounce or gaussians.count == 0:
             return None
-        read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
-        if self._held is None and not _are_same(read, self._around.read):
+        if self._held and len(self._held.means) != gaussians.count:
+            raise ValueError(f"surroundings: held for {len(self._held.means)} Gaussians, found {gaussians.count}")
+        read = [] if self._held else [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
+        if self._around.surroundings is None or not _are_same(read, self._around.read):
+            surfaces = self._held or self._surfaces(gaussians)
             self._around = _Around([], None)  # frees memory for the next
             rays = gaussians.count * ray_count(self.config.bounce)
-            if select() == "llvm" and rays > MANY_RAYS:
+            if select() == "llvm" and rays > MANY_RAYS and not self._held:
                 log.info("light that bounces: %.0f million rays are traced, once for all pictures", rays / 1e6)
-            self._around = _Around(_kept(read), self._look_around(self._surfaces(gaussians)))
+            self._around = _Around(_kept(read), look_around(surfaces, self.config.bounce, self.frame.radius))
         return self._around.surroundings
 
     def hold_surroundings(self, of: Gaussians | Surfaces | None) -> None:
         """In training Gaussians move in each step: light bounces as if they stood where these do, as many as they are,
         until this is called again. None: where they stand"""
-        held = self._surfaces(of) if isinstance(of, Gaussians) else of
-        self._held, self._around = None, _Around([], None)
+        self._held = self._surfaces(of) if isinstance(of, Gaussians) else of
+        self._around = _Around([], None)
         self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # its emitters have other numbers
-        if held is not None:
-            self._around = _Around([], self._look_around(held))
-            self._held = held
 
     @property
     def held_surfaces(self) -> Surfaces | None:
@@ -227,9 +227,6 @@ class LightModel:
 
     def _surfaces(self, gaussians: Gaussians) -> Surfaces:
         return Surfaces.of(gaussians, self.config.field.features)
-
-    def _look_around(self, surfaces: Surfaces) -> Surroundings:
-        return look_around(surfaces, self.config.bounce, self.frame.radius)
 
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for

@@ -21,7 +21,9 @@ from spacesim.splat.light.disc_grid import MISSED, DiscGrid
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.records import packets, store
 
-FIRST, EVERY = (50, 100, 200), 500  #: steps of training after which rays are traced anew
+#: steps of training after which rays are traced anew: the first ones, and each so many from the last of them on, which
+#: none of them is near an opacity reset, after which rays meet nothing
+FIRST, EVERY = (50, 100, 200), 500
 MOST_RAYS = 512  #: from each Gaussian; docs/research/light.md
 LEAST_RAYS = 128  #: from each Gaussian
 EMITTERS_PER_RAY = 8  #: while that makes neither more nor fewer rays
@@ -58,17 +60,20 @@ class Surfaces:
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {f"surfaces.{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @staticmethod
-    def from_tensors(tensors: Mapping[str, np.ndarray]) -> "Surfaces":
-        """The inverse of `tensors`. Raises KeyError where one is missing, ValueError where shapes do not fit."""
-        count = len(tensors["means"])
+    def from_tensors(tensors: Mapping[str, np.ndarray], count: int) -> "Surfaces | None":
+        """The inverse of `tensors`, of so many; None where a checkpoint holds none. Raises KeyError where some are
+        missing, ValueError where shapes do not fit."""
+        if not any(name.startswith("surfaces.") for name in tensors):
+            return None
         shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logit_opacities": (), "normals": (3,)}
+        values = {name: tensors[f"surfaces.{name}"] for name in shapes}
         for name, shape in shapes.items():
-            if tensors[name].shape != (count, *shape):
-                raise ValueError(f"{name}: expected {count} of shape {shape}, found {tensors[name].shape}")
-        return Surfaces(**{name: np.asarray(tensors[name], np.float32) for name in shapes})
+            if values[name].shape != (count, *shape):
+                raise ValueError(f"surfaces.{name}: expected {(count, *shape)}, found {values[name].shape}")
+        return Surfaces(**{name: np.asarray(value, np.float32) for name, value in values.items()})
 
 
 @dataclass
@@ -84,7 +89,7 @@ class Surroundings:
 
 def are_due(step: int) -> bool:
     """Whether rays are traced anew after so many steps, the first time before the first."""
-    return step in FIRST or step % EVERY == 0
+    return step in FIRST or step % EVERY == FIRST[-1]
 
 
 def ray_count(emitters: int) -> int:
@@ -98,17 +103,41 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     pairs = len(directions) // 2
     rows = [upload(row) for row in directions.reshape(pairs, 6).T]
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
-    normals = _unit(surfaces.normals)
-    curve = _along_curve(surfaces, radius)
-    numbers, emitter_of = _choose(surfaces, normals, curve, emitters, radius)
+    shapes = _Shapes.of(surfaces, radius)
+    numbers, emitter_of = _choose(shapes, emitters)
     seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * len(surfaces.means))
-    discs = _Discs.of(surfaces, radius)
+    discs = _Discs.of(shapes)
     if len(discs.numbers):
-        order = upload(np.argsort(curve, kind="stable"), ad.UInt32)
-        _trace(seen, order, surfaces, normals, discs, directions, numbers, emitter_of, radius)
+        _trace(seen, shapes, discs, directions, emitter_of)
     result = Surroundings(upload(numbers, ad.UInt32), seen, packed)
     dr.eval(result)
     return result
+
+
+@dataclass
+class _Shapes:
+    """N surfaces as tracing takes them, float64."""
+
+    surfaces: Surfaces
+    radius: float  #: of the model, metres
+    scales: Array  #: [N, 3] metres
+    areas: Array  #: [N] m^2: the product of the two longer ones
+    opacities: Array  #: [N] in [0, 1]; 0 of what is no number
+    normals: Array  #: [N, 3] of unit length; (0, 0, 1) in place of what has no direction
+    middle: Array  #: [3] metres: the median of the places that are numbers
+    #: [N] places along a curve through all cells of a cube (Morton 1966): near ones are mostly near on it
+    curve: NDArray[np.int64]
+
+    @staticmethod
+    def of(surfaces: Surfaces, radius: float) -> "_Shapes":
+        middle = _middle(surfaces)
+        with np.errstate(over="ignore", invalid="ignore"):
+            scales = np.exp(surfaces.log_scales.astype(np.float64))
+            x, y, z = scales.T
+            areas = np.maximum(np.maximum(x * y, y * z), z * x)
+            opacities = np.nan_to_num(1 / (1 + np.exp(-surfaces.logit_opacities.astype(np.float64))))
+        curve = _along_curve(surfaces.means - (middle - 2 * radius), 4 * radius)
+        return _Shapes(surfaces, radius, scales, areas, opacities, _unit(surfaces.normals), middle, curve)
 
 
 @dataclass
@@ -120,17 +149,19 @@ class _Discs:
     axes: Array  #: [n, 2, 3] metres, the semi-axes
 
     @staticmethod
-    def of(surfaces: Surfaces, radius: float) -> "_Discs":
-        opacity, scales = _opacities(surfaces), np.maximum(_scales(surfaces), LEAST_SCALE * radius)
+    def of(shapes: _Shapes) -> "_Discs":
+        surfaces, opacity, radius = shapes.surfaces, shapes.opacities, shapes.radius
+        scales = np.maximum(shapes.scales, LEAST_SCALE * radius)
         reach = np.sqrt(2 * np.log(np.maximum(opacity, OPAQUE) / EDGE))
         x, y, z = scales.T
         length2 = np.einsum("ni,ni->n", surfaces.quaternions, surfaces.quaternions, dtype=np.float64)
         keep = (opacity > OPAQUE) & (length2 > 0) & np.isfinite(length2)
         keep &= np.maximum(np.maximum(x, y), z) * reach < radius
-        for column, middle in zip(surfaces.means.T, _middle(surfaces), strict=True):
+        for column, middle in zip(surfaces.means.T, shapes.middle, strict=True):
             keep &= np.abs(column - middle) < FARTHEST_DISC * radius
         numbers = np.flatnonzero(keep).astype(np.uint32)
-        shortest = scales[numbers].argmin(axis=1)
+        x, y, z = (axis[numbers] for axis in (x, y, z))
+        shortest = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
         turns, place = rotation_from_quaternion(surfaces.quaternions[numbers]), np.arange(len(numbers))
         axes = np.empty((len(numbers), 2, 3))
         for i in range(2):
@@ -139,25 +170,13 @@ class _Discs:
         return _Discs(numbers, surfaces.means[numbers].astype(np.float64), axes)
 
 
-def _trace(
-    seen: UInt32,
-    order: UInt32,
-    surfaces: Surfaces,
-    normals: Array,
-    discs: _Discs,
-    directions: Array,
-    numbers: NDArray[np.uint32],
-    emitter_of: NDArray[np.uint32],
-    radius: float,
-) -> None:
-    """Fill in `Surroundings.seen`. order: of the Gaussians, [N], such that near ones, whose rays take as long,
-    follow on each other"""
-    grid, count = DiscGrid.of(discs.centers, discs.axes), len(discs.numbers)
-    with np.errstate(over="ignore"):
-        away = np.nan_to_num(np.minimum(AWAY * np.sqrt(_squares(_scales(surfaces))), FARTHEST * radius))
-    place, normal, towards = (_vectors(of) for of in (surfaces.means, normals, directions))
+def _trace(seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, emitter_of: NDArray[np.uint32]) -> None:
+    """Fill in `Surroundings.seen`. emitter_of: as `_choose` says"""
+    grid = DiscGrid.of(discs.centers, discs.axes)
+    away = np.nan_to_num(np.minimum(AWAY * np.sqrt(shapes.areas), FARTHEST * shapes.radius))
+    place, normal, towards = (_vectors(of) for of in (shapes.surfaces.means, shapes.normals, directions))
     number_of, emitter = (upload(of, ad.UInt32) for of in (discs.numbers, emitter_of))
-    facing = _vectors(normals[numbers])
+    order = upload(np.argsort(shapes.curve, kind="stable"), ad.UInt32)  # near ones, whose rays take as long, together
     distance, gaussians = upload(away), dr.opaque(ad.UInt32, len(away))
     pairs, at_once = len(directions) // 2, max(RAYS_AT_ONCE[select()] // (2 * len(away)), 1)
     for first in range(0, pairs, at_once):
@@ -169,46 +188,41 @@ def _trace(
             side = dr.gather(ad.Array3f, normal, index)
             over = dr.select(dr.dot(side, direction) < 0, -1, 1) * dr.gather(ad.Float, distance, index)
             start = dr.gather(ad.Array3f, place, index) + over * side
-            disc = grid.first_met(count, start, direction, dr.isfinite(dr.sum(start)))
+            disc = grid.first_met(start, direction, dr.isfinite(dr.sum(start)))
             hit = disc != MISSED
-            met = dr.gather(ad.UInt32, emitter, dr.gather(ad.UInt32, number_of, disc, hit), hit)
-            is_back = dr.dot(dr.gather(ad.Array3f, facing, met, hit), direction) > 0
+            number = dr.gather(ad.UInt32, number_of, disc, hit)
+            is_back = dr.dot(dr.gather(ad.Array3f, normal, number, hit), direction) > 0
+            met = dr.gather(ad.UInt32, emitter, number, hit)
             word |= dr.select(hit, 2 * met + dr.select(is_back, ad.UInt32(1), 0), SKY) << (16 * half)
         dr.scatter(seen, word, pair * gaussians + index)
         dr.eval(seen)
 
 
-def _choose(
-    surfaces: Surfaces, normals: Array, curve: NDArray[np.int64], count: int, radius: float
-) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+def _choose(shapes: _Shapes, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     """(emitters [count], which of them stands for each Gaussian [N]): of the Gaussians in the order of the axis along
-    which their normals point most, then of `_along_curve`, one in the middle of each of `count` parts of equal area;
+    which their normals point most, then of `_Shapes.curve`, one in the middle of each of `count` parts of equal area;
     all, once each, where they are no more. The nearest stands for a Gaussian, by place and normal."""
-    total = len(surfaces.means)
+    means, normals, total = shapes.surfaces.means, shapes.normals, len(shapes.curve)
     if total <= count:
         return np.resize(np.arange(total, dtype=np.uint32), count), np.arange(total, dtype=np.uint32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        area = np.minimum(_squares(_scales(surfaces)), (CHOSEN * radius) ** 2) * _opacities(surfaces)
-    sound = np.isfinite(surfaces.means).all(axis=1) & (area > 0)
+    area = np.minimum(shapes.areas, (CHOSEN * shapes.radius) ** 2) * shapes.opacities
+    sound = np.isfinite(means).all(axis=1) & (area > 0)
     if not sound.any():
         return np.zeros(count, np.uint32), np.zeros(total, np.uint32)
     axis = np.abs(normals).argmax(axis=1)
     points_back = normals[np.arange(total), axis] < 0
-    order = np.argsort(curve + ((2 * axis + points_back) << 30), kind="stable")
+    order = np.argsort(shapes.curve + ((2 * axis + points_back) << 30), kind="stable")
     ends = np.cumsum(np.where(sound, area, 0)[order])
     middles = (np.arange(count) + 0.5) / count * ends[-1]
     emitters = order[np.searchsorted(ends, middles, side="right")].astype(np.uint32)
-    places = np.hstack([np.where(sound[:, None], surfaces.means, 0), NORMALS_APART * radius * normals])
+    places = np.hstack([np.where(sound[:, None], means, 0), NORMALS_APART * shapes.radius * normals])
     _, nearest = cKDTree(places[emitters]).query(places, workers=-1)
     return emitters, nearest.astype(np.uint32)
 
 
-def _along_curve(surfaces: Surfaces, radius: float) -> NDArray[np.int64]:
-    """[N] places of the Gaussians along a curve through all cells of a cube (Morton 1966): near ones are mostly near on
-    it."""
-    low = _middle(surfaces) - 2 * radius
-    cells = (surfaces.means - low) * (CELLS / (4 * radius))
-    spread = np.clip(np.nan_to_num(cells, posinf=0, neginf=0), 0, CELLS - 1).astype(np.int64)
+def _along_curve(places: Array, side: float) -> NDArray[np.int64]:
+    """[N] see `_Shapes.curve`. places: [N, 3] in a cube of this side with a corner at 0"""
+    spread = np.clip(np.nan_to_num(places * (CELLS / side), posinf=0, neginf=0), 0, CELLS - 1).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         spread = (spread | spread << shift) & mask
     return spread[:, 0] | spread[:, 1] << 1 | spread[:, 2] << 2
@@ -218,23 +232,6 @@ def _middle(surfaces: Surfaces) -> Array:
     """[3] metres: the median of the places that are numbers."""
     means = surfaces.means[np.isfinite(surfaces.means).all(axis=1)].astype(np.float64)
     return np.median(means, axis=0) if len(means) else np.zeros(3)
-
-
-def _scales(surfaces: Surfaces) -> Array:
-    """[N, 3] metres."""
-    with np.errstate(over="ignore"):
-        return np.exp(surfaces.log_scales.astype(np.float64))
-
-
-def _squares(scales: Array) -> Array:
-    """[N] m^2: the product of the two longer ones of [N, 3]."""
-    return np.sort(scales, axis=1)[:, 1:].prod(axis=1)
-
-
-def _opacities(surfaces: Surfaces) -> Array:
-    """[N] in [0, 1]; 0 of what is no number."""
-    with np.errstate(over="ignore"):
-        return np.nan_to_num(1 / (1 + np.exp(-surfaces.logit_opacities.astype(np.float64))))
 
 
 def _unit(normals: NDArray[np.float32]) -> Array:

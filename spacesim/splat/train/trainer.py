@@ -146,12 +146,12 @@ class Trainer(TrainingLoop):
 
     def _refine(self) -> None:
         """After a step: the strategy refines the set of Gaussians, or the warm start does while it lasts."""
-        before = self.gaussians.logit_opacities
+        x, opacities = self.gaussians.means.x, self.gaussians.logit_opacities
         self._refine_gaussians()
-        if self.gaussians.logit_opacities.index != before.index:
+        if self.gaussians.logit_opacities.index != opacities.index:
             self._view_pass.lists.after_refinement()
-            if self.light:
-                self.light.hold_surroundings(None)
+        if self.light and self.gaussians.means.x.index != x.index:  # an opacity reset hides nothing
+            self.light.hold_surroundings(None)
 
     def _refine_gaussians(self) -> None:
         warm, done = self.warm_start, self.iteration
@@ -267,7 +267,7 @@ class Trainer(TrainingLoop):
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
         held = self.light.held_surfaces if self.light else None
         if held is not None:
-            tensors |= {f"surfaces.{name}": values for name, values in held.tensors().items()}
+            tensors |= held.tensors()
         if self.warm_start and self._warming(self.iteration):
             tensors |= {f"warm_start.{name}": np.array(value) for name, value in self.warm_start.state.items()}
         return tensors
@@ -291,12 +291,8 @@ class Trainer(TrainingLoop):
         optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
         _restore_moments(optimizer, tensors, "adam")
         _restore_moments(light_optimizer, tensors, "adam.light")
-        if light and "surfaces.means" in tensors:
-            named = {name.removeprefix("surfaces."): tensors[name] for name in tensors if name.startswith("surfaces.")}
-            held = Surfaces.from_tensors(named)
-            if len(held.means) != gaussians.count:
-                raise ValueError(f"surfaces.means: expected {gaussians.count}, found {len(held.means)}")
-            light.hold_surroundings(held)
+        if light:
+            light.hold_surroundings(Surfaces.from_tensors(tensors, gaussians.count))
         self.pictures.restore(tensors)
         state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
         warming = self.warm_start is not None and self._warming(header.iteration)

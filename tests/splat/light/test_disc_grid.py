@@ -64,7 +64,7 @@ def test_the_nearest_is_met_and_of_equally_near_ones_the_first(name, rays):
     start, towards = (np.float32(rows).astype(np.float64) for rows in (start, towards))
     place, direction = (ad.Array3f([upload(column) for column in rows.T]) for rows in (start, towards))
     grid = DiscGrid.of(centers, axes)
-    found = np.array(grid.first_met(len(centers), place, direction, dr.arange(ad.UInt32, RAYS) % 50 != 0))
+    found = np.array(grid.first_met(place, direction, dr.arange(ad.UInt32, RAYS) % 50 != 0))
     expected = first_met(centers, axes, start, towards)
     expected[::50] = MISSED  # rays that are not asked about
     assert (expected != MISSED).sum() > 20

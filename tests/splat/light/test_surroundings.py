@@ -1,10 +1,12 @@
 """What Gaussians see around them, against rays in float64, and training that goes on from a checkpoint."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
+import drjit as dr
 import numpy as np
 import pytest
 
+from spacesim.backend import ad
 from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig
@@ -20,11 +22,13 @@ from spacesim.splat.light.surroundings import (
     SKY,
     Surfaces,
     Surroundings,
+    are_due,
     look_around,
     ray_count,
 )
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import preset, with_options
+from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 
 RADIUS = 2.0  #: of the models here
@@ -41,6 +45,15 @@ def surfaces(count: int, seed: int = 0, size: float = 0.2) -> Surfaces:
         "normals": rng.normal(size=(count, 3)),
     }
     return Surfaces(**{name: np.float32(values) for name, values in arrays.items()})
+
+
+def lit_model(of: Surfaces, emitters: int) -> tuple[LightModel, Gaussians]:
+    config = LightConfig(FieldConfig(features=2, width=4, layers=2, inputs=SurfaceConfig()), bounce=emitters)
+    arrays = {field.name: getattr(of, field.name) for field in fields(Surfaces)}
+    count, normals = len(of.means), arrays.pop("normals")
+    features = np.column_stack([np.zeros((count, 2)), normals, np.zeros((count, 3))])
+    splats = Gaussians.from_numpy({**arrays, "sh": np.zeros((count, 0, 3)), "features": features})
+    return LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 5.0, RADIUS), 0), splats
 
 
 def seen_along(surroundings: Surroundings, count: int) -> np.ndarray:
@@ -127,11 +140,7 @@ def test_where_the_world_begins_makes_no_difference():
 
 
 def test_what_takes_seconds_says_so_once(monkeypatch, caplog):
-    config = LightConfig(FieldConfig(features=2, width=4, layers=2, inputs=SurfaceConfig()), bounce=50)
-    light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 5.0, RADIUS), 0)
-    arrays = surfaces(20).tensors()
-    features = np.column_stack([np.zeros((20, 2)), arrays.pop("normals"), np.zeros((20, 3))])
-    splats = Gaussians.from_numpy({**arrays, "sh": np.zeros((20, 0, 3)), "features": features})
+    light, splats = lit_model(surfaces(20), 50)
     monkeypatch.setattr(light_module, "MANY_RAYS", 20 * LEAST_RAYS - 1)
     monkeypatch.setattr(light_module, "select", lambda: "llvm")
     with caplog.at_level("INFO"):
@@ -144,12 +153,47 @@ def test_what_takes_seconds_says_so_once(monkeypatch, caplog):
 
 def test_surfaces_of_a_checkpoint_are_checked():
     tensors = surfaces(5).tensors()
-    for name, values in Surfaces.from_tensors(tensors).tensors().items():
+    back = Surfaces.from_tensors(tensors, 5)
+    assert back is not None
+    for name, values in back.tensors().items():
         np.testing.assert_array_equal(values, tensors[name])
-    with pytest.raises(ValueError, match="normals: expected 5"):
-        Surfaces.from_tensors({**tensors, "normals": tensors["normals"][:4]})
-    with pytest.raises(KeyError):
-        Surfaces.from_tensors({name: values for name, values in tensors.items() if name != "quaternions"})
+    assert Surfaces.from_tensors({"means": tensors["surfaces.means"]}, 5) is None
+    name = "surfaces.normals"
+    with pytest.raises(ValueError, match=r"surfaces\.normals: expected \(5, 3\), found \(4, 3\)"):
+        Surfaces.from_tensors({**tensors, name: tensors[name][:4]}, 5)
+    with pytest.raises(KeyError, match=r"surfaces\.quaternions"):
+        Surfaces.from_tensors({name: values for name, values in tensors.items() if name != "surfaces.quaternions"}, 5)
+
+
+def test_what_is_held_is_of_as_many_gaussians():
+    light, splats = lit_model(surfaces(20), 50)
+    light.hold_surroundings(surfaces(21))
+    with pytest.raises(ValueError, match="held for 21 Gaussians, found 20"):
+        light.surroundings(splats)
+    light.hold_surroundings(surfaces(20))
+    assert light.surroundings(splats) is light.surroundings(splats)
+
+
+def test_an_opacity_reset_hides_no_surroundings(small_lit_dataset):
+    """All opacities fall below what stops rays; until they are back, what was seen before them is."""
+    config = with_options(preset("demo", "shadow-map"), iterations=40, init_count=200)
+    refinement = replace(config.refinement, refine_every=5, reset_every=2, refine_stop=30, pause_after_reset=10)
+    trainer = Trainer(small_lit_dataset, replace(config, refinement=replace(refinement, refine_start=5)))
+    trainer.gaussians.logit_opacities = dr.opaque(ad.Float, 2.0, trainer.gaussians.count)
+    assert trainer.light is not None
+    while trainer.iteration < 20:
+        trainer.step()
+    opacities = 1 / (1 + np.exp(-trainer.gaussians.to_numpy()["logit_opacities"]))
+    assert opacities.max() < OPAQUE, "reset"
+    around = trainer.light.surroundings(trainer.gaussians)
+    assert around is not None
+    assert (seen_along(around, trainer.gaussians.count) != SKY).mean() > 0.05
+
+
+def test_no_look_around_falls_on_an_opacity_reset():
+    assert [step for step in range(1300) if are_due(step)] == [50, 100, 200, 700, 1200]
+    reset = DensificationConfig().reset_every * DensificationConfig().refine_every
+    assert not any(are_due(step) for times in range(1, 6) for step in range(times * reset, times * reset + 200))
 
 
 def test_training_goes_on_to_the_bit_between_two_looks_around(small_lit_dataset, tmp_path):
