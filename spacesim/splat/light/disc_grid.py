@@ -4,18 +4,18 @@ Of two discs equally far, as those in one plane are, a ray tracer's hierarchy ma
 Here the one of the lower number is met, so that training repeats to the bit, with OptiX or without.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
-from spacesim.backend.upload import upload
-from spacesim.data.geometry import Array
 from spacesim.splat.raster.records import load, packets, store
+from spacesim.splat.raster.tiles import round_capacity
 
 MISSED = 0xFFFFFFFF  #: in place of a disc's number
 MOST_CELLS = 160  #: along the longest side
@@ -38,32 +38,33 @@ class DiscGrid:
     columns: tuple[UInt32, UInt32, UInt32]  #: cells along each axis
 
     @staticmethod
-    def of(centers: Array, axes: Array) -> "DiscGrid":
-        """centers: [n, 3] metres;  axes: [n, 2, 3] metres, at right angles, the semi-axes, above 0 all"""
-        squares = np.einsum("nij,nij->ni", axes, axes)
-        half = np.sqrt(axes[:, 0] ** 2 + axes[:, 1] ** 2)
-        low, high = (centers - half).min(axis=0), (centers + half).max(axis=0)
-        size = float((high - low).max())
-        longer = np.sqrt(np.maximum(squares[:, 0], squares[:, 1]))
-        cell = max(CELL * float(np.median(longer)), size / MOST_CELLS, 1e-9)
-        while _products((boxes := _cells(centers - low, half, cell))[1]).sum() > MOST_ENTRIES:
+    def of(centers: Array3f, axes: Sequence[Array3f]) -> "DiscGrid":
+        """centers: [3, n] metres, finite;  axes: two of [3, n] metres, at right angles, the semi-axes, above 0 all"""
+        squares = [dr.squared_norm(axis) for axis in axes]
+        half = dr.sqrt(dr.square(axes[0]) + dr.square(axes[1]))
+        low, high, longer = centers - half, centers + half, dr.sqrt(dr.maximum(squares[0], squares[1]))
+        dr.eval(low, high, longer)
+        corner, end = (np.array(dr.ravel(edge), float) for edge in (dr.min(low, axis=1), dr.max(high, axis=1)))
+        size = float((end - corner).max())
+        cell = max(CELL * float(np.median(longer.numpy())), size / MOST_CELLS, 1e-9)
+        normals = dr.cross(*axes) * dr.rsqrt(squares[0] * squares[1])
+        corner_of = ad.Array3f([dr.opaque(ad.Float, value) for value in corner.tolist()])
+        while True:
+            cell_of = dr.opaque(ad.Float, cell)
+            boxes = _Boxes.of((low - corner_of) / cell_of, (high - corner_of) / cell_of)
+            entries = boxes.entries()
+            if entries <= MOST_ENTRIES:
+                break
             cell *= 2
-        columns = boxes[0].max(axis=0) + boxes[1].max(axis=0)
-        scaled, normals = axes / squares[:, :, None], np.cross(axes[:, 0], axes[:, 1])
-        normals /= np.sqrt(squares[:, 0] * squares[:, 1])[:, None]
-        discs, starts = _lists(*boxes, columns, normals, np.einsum("ni,ni->n", normals, (centers - low) / cell))
-        index = dr.arange(ad.UInt32, len(centers))
-        columns_of = [upload(row) for row in np.hstack([centers, normals, scaled.reshape(-1, 6)]).T]
-        records = [store(values, index, len(centers)) for values in packets(columns_of)]
-        grid = DiscGrid(
-            len(centers),
-            records,
-            discs,
-            starts,
-            ad.Array3f([dr.opaque(ad.Float, float(value)) for value in low]),
-            dr.opaque(ad.Float, cell),
-            _opaque(columns),
+        columns = [int(count) for count in np.floor((end - corner) / cell) + 2]
+        discs, starts = _lists(boxes, entries, columns, normals, dr.dot(normals, (centers - corner_of) / cell_of))
+        scaled, index = (
+            [axis / square for axis, square in zip(axes, squares, strict=True)],
+            dr.arange(ad.UInt32, len(longer)),
         )
+        numbers = [value for vector in (centers, normals, *scaled) for value in vector]
+        records = [store(values, index, len(longer)) for values in packets(numbers)]
+        grid = DiscGrid(len(longer), records, discs, starts, corner_of, cell_of, _opaque(columns))
         dr.eval(grid)
         return grid
 
@@ -124,47 +125,62 @@ class DiscGrid:
         return dr.while_loop(state, goes_on, step, mode="symbolic", label="first disc")[-1]
 
 
-def _cells(centers: Array, half: Array, cell: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(first cell, number of cells) [n, 3] along each axis of the boxes of `half` about `centers` [n, 3]."""
-    first = np.maximum((centers - half) / cell, 0).astype(np.int64)
-    return first, ((centers + half) / cell).astype(np.int64) - first + 1
+@dataclass
+class _Boxes:
+    """Boxes of cells, [n] of each."""
+
+    first: list[UInt32]  #: the first along each axis
+    sides: list[UInt32]  #: how many along each
+    count: UInt32  #: in all
+
+    @staticmethod
+    def of(low: Array3f, high: Array3f) -> "_Boxes":
+        """low, high: corners [3, n], in cells, which are whole numbers from 0 on"""
+        first = [ad.UInt32(dr.maximum(edge - ROUNDING, 0)) for edge in low]
+        sides = [ad.UInt32(edge + ROUNDING) - start + 1 for edge, start in zip(high, first, strict=True)]
+        return _Boxes(first, sides, sides[0] * sides[1] * sides[2])
+
+    def entries(self) -> int:
+        """Of discs in cells. Waits for the device."""
+        dr.eval(self)
+        return int(dr.sum(ad.UInt64(self.count))[0])
 
 
 def _lists(
-    first: NDArray[np.int64], sides: NDArray[np.int64], columns: NDArray[np.int64], normals: Array, offsets: Array
+    boxes: _Boxes, entries: int, columns: Sequence[int], normals: Array3f, offsets: Float
 ) -> tuple[UInt32, UInt32]:
-    """(discs cell by cell, in a cell in any order, where each cell's start and the last one's end): of boxes of cells,
-    see `_cells`, those that the disc's plane n.x = d cuts. columns: cells along each axis;  normals: [n, 3], unit;
-    offsets: d, [n], in cells from the corner"""
-    counts = _products(sides)
-    before = np.cumsum(counts) - counts
-    disc = upload(np.repeat(np.arange(len(first)), counts), ad.UInt32)
-    number = dr.arange(ad.UInt32, dr.width(disc)) - dr.gather(ad.UInt32, upload(before, ad.UInt32), disc)
-    x, y, z = (dr.gather(ad.UInt32, upload(values, ad.UInt32), disc) for values in first.T)
+    """(discs cell by cell, in a cell in any order, where each cell's start and the last one's end): of boxes of cells
+    those that the disc's plane n.x = d cuts. columns: cells along each axis;  normals: [3, n], unit;  offsets: d, [n],
+    in cells from the corner"""
+    before = dr.prefix_reduce(dr.ReduceOp.Add, boxes.count, exclusive=True)
+    disc = dr.opaque(ad.UInt32, 0, round_capacity(entries))
+    dr.scatter(disc, dr.arange(ad.UInt32, dr.width(before)), before)
+    dr.eval(disc, normals, offsets)
+    disc = dr.prefix_reduce(dr.ReduceOp.Max, disc, exclusive=False)
+    dr.eval(disc)
+    number = dr.arange(ad.UInt32, dr.width(disc)) - dr.gather(ad.UInt32, before, disc)
     # no division by 0 in lanes beyond the last one, which run along
-    wide, high, _ = (dr.maximum(dr.gather(ad.UInt32, upload(values, ad.UInt32), disc), 1) for values in sides.T)
-    nx, ny, _ = _opaque(columns)
-    x, y, z = x + number % wide, y + number // wide % high, z + number // wide // high
-    a, b, c, d = (dr.gather(ad.Float, upload(values), disc) for values in (*normals.T, offsets))
-    middle: list[Float] = [ad.Float(number) + 0.5 for number in (x, y, z)]
-    away: Float = dr.abs(a * middle[0] + b * middle[1] + c * middle[2] - d)
+    wide, high = (dr.maximum(dr.gather(ad.UInt32, side, disc), 1) for side in boxes.sides[:2])
+    steps = number % wide, number // wide % high, number // wide // high
+    x, y, z = (dr.gather(ad.UInt32, start, disc) + step for start, step in zip(boxes.first, steps, strict=True))
+    a, b, c = dr.gather(ad.Array3f, normals, disc)
+    middle: list[Float] = [ad.Float(place) + 0.5 for place in (x, y, z)]
+    away: Float = dr.abs(a * middle[0] + b * middle[1] + c * middle[2] - dr.gather(ad.Float, offsets, disc))
     is_cut = away < 0.5 * (dr.abs(a) + dr.abs(b) + dr.abs(c)) + ROUNDING
+    is_cut &= number < dr.gather(ad.UInt32, boxes.count, disc)
+    nx, ny, _ = _opaque(columns)
     cell = (z * ny + y) * nx + x
-    lengths = dr.opaque(ad.UInt32, 0, int(columns.prod()) + 1)
+    lengths = dr.opaque(ad.UInt32, 0, round_capacity(math.prod(columns) + 1))
     place = cast(UInt32, dr.scatter_inc(lengths, cell, is_cut))
     dr.eval(place, cell, is_cut, lengths)
     starts = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=True)
     dr.eval(starts)
     discs = dr.opaque(ad.UInt32, 0, dr.width(disc))
-    dr.scatter(discs, disc, dr.gather(ad.UInt32, starts, cell) + place, is_cut)
+    dr.scatter(discs, disc, dr.gather(ad.UInt32, starts, cell, is_cut) + place, is_cut)
     dr.eval(discs)
     return discs, starts
 
 
-def _products(sides: NDArray[np.int64]) -> NDArray[np.int64]:
-    return sides[:, 0] * sides[:, 1] * sides[:, 2]
-
-
-def _opaque(columns: NDArray[np.int64]) -> tuple[UInt32, UInt32, UInt32]:
-    x, y, z = (dr.opaque(ad.UInt32, int(count)) for count in columns)
+def _opaque(columns: Sequence[int]) -> tuple[UInt32, UInt32, UInt32]:
+    x, y, z = (dr.opaque(ad.UInt32, count) for count in columns)
     return x, y, z

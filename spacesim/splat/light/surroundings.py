@@ -7,6 +7,7 @@ training each time that Gaussians come or go, and now and then (`are_due`).
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import cast
 
 import drjit as dr
 import numpy as np
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Array3f, Float, UInt32
-from spacesim.backend.upload import upload
-from spacesim.data.geometry import Array, fibonacci_sphere, rotation_from_quaternion
+from spacesim.backend.arrays import Array3f, Array4f, Float, UInt32
+from spacesim.backend.upload import upload, upload_rows
+from spacesim.data.geometry import Array, fibonacci_sphere
+from spacesim.learning.reflectance import unit_normals
 from spacesim.splat.light.disc_grid import MISSED, DiscGrid
-from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.raster.records import packets, store
 
 #: steps of training after which rays are traced anew: the first ones, and each so many from the last of them on, which
@@ -40,6 +42,9 @@ SKY = 0xFFFF  #: of `Surroundings.seen`: nothing
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
 
 
+Indices = NDArray[np.signedinteger] | NDArray[np.unsignedinteger]
+
+
 @dataclass(frozen=True, eq=False)
 class Surfaces:
     """Gaussians as rays meet them, N of them, float32."""
@@ -53,10 +58,14 @@ class Surfaces:
     @staticmethod
     def of(gaussians: Gaussians, first_normal: int) -> "Surfaces":
         """first_normal: row of the features from which on normals stand"""
-        arrays = gaussians.to_numpy()
-        normals = arrays["features"][:, first_normal : first_normal + 3]
-        arrays = {field.name: arrays[field.name] for field in fields(Surfaces) if field.name != "normals"}
-        return Surfaces(**arrays, normals=np.ascontiguousarray(normals))
+        assert gaussians.features is not None, "normals are features"
+        shape = (gaussians.means, gaussians.log_scales, gaussians.quaternions)
+        means, log_scales, quaternions = (np.ascontiguousarray(vectors.numpy().T) for vectors in shape)
+        first, count = first_normal * gaussians.count, gaussians.count
+        index = dr.arange(ad.UInt32, 3 * count) + dr.opaque(ad.UInt32, first)
+        normals = dr.gather(ad.Float, gaussians.features, index).numpy().reshape(3, count)
+        opacity = gaussians.logit_opacities.numpy().copy()
+        return Surfaces(means, log_scales, quaternions, opacity, np.ascontiguousarray(normals.T))
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
@@ -103,12 +112,15 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     pairs = len(directions) // 2
     rows = [upload(row) for row in directions.reshape(pairs, 6).T]
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
-    shapes = _Shapes.of(surfaces, radius)
-    numbers, emitter_of = _choose(shapes, emitters)
+    shapes = _Shapes.of(surfaces)
+    middle = _middle(surfaces)
+    curve = _along_curve(shapes.means, middle - 2 * radius, 4 * radius).numpy()
+    order = np.argsort(curve, kind="stable")
+    numbers, emitter_of = _choose(shapes, order, emitters, radius)
     seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * len(surfaces.means))
-    discs = _Discs.of(shapes)
-    if len(discs.numbers):
-        _trace(seen, shapes, discs, directions, emitter_of)
+    discs = _Discs.of(shapes, middle, radius)
+    if discs is not None:
+        _trace(seen, shapes, discs, directions, order, emitter_of, radius)
     result = Surroundings(upload(numbers, ad.UInt32), seen, packed)
     dr.eval(result)
     return result
@@ -116,132 +128,134 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
 
 @dataclass
 class _Shapes:
-    """N surfaces as tracing takes them, float64."""
+    """N surfaces as tracing takes them."""
 
-    surfaces: Surfaces
-    radius: float  #: of the model, metres
-    scales: Array  #: [N, 3] metres
-    areas: Array  #: [N] m^2: the product of the two longer ones
-    opacities: Array  #: [N] in [0, 1]; 0 of what is no number
-    normals: Array  #: [N, 3] of unit length; (0, 0, 1) in place of what has no direction
-    middle: Array  #: [3] metres: the median of the places that are numbers
-    #: [N] places along a curve through all cells of a cube (Morton 1966): near ones are mostly near on it
-    curve: NDArray[np.int64]
+    means: Array3f  #: [3, N] metres
+    scales: Array3f  #: [3, N] metres
+    quaternions: Array4f  #: [4, N]
+    opacities: Float  #: [N] in [0, 1]; 0 of what is no number
+    normals: Array3f  #: [3, N], unit
+    areas: Float  #: [N] m^2: the product of the two longer scales
 
     @staticmethod
-    def of(surfaces: Surfaces, radius: float) -> "_Shapes":
-        middle = _middle(surfaces)
-        with np.errstate(over="ignore", invalid="ignore"):
-            scales = np.exp(surfaces.log_scales.astype(np.float64))
-            x, y, z = scales.T
-            areas = np.maximum(np.maximum(x * y, y * z), z * x)
-            opacities = np.nan_to_num(1 / (1 + np.exp(-surfaces.logit_opacities.astype(np.float64))))
-        curve = _along_curve(surfaces.means - (middle - 2 * radius), 4 * radius)
-        return _Shapes(surfaces, radius, scales, areas, opacities, _unit(surfaces.normals), middle, curve)
+    def of(surfaces: Surfaces) -> "_Shapes":
+        rows = (surfaces.means, surfaces.log_scales, surfaces.normals)
+        means, log_scales, normals = (upload_rows(values.T) for values in rows)
+        scales, opacity = dr.exp(log_scales), opacities(upload(surfaces.logit_opacities))
+        x, y, z = scales
+        shapes = _Shapes(
+            means,
+            scales,
+            ad.Array4f([upload(row) for row in surfaces.quaternions.T]),
+            dr.select(dr.isfinite(opacity), opacity, 0),
+            unit_normals(normals),
+            dr.maximum(dr.maximum(x * y, y * z), z * x),
+        )
+        dr.eval(shapes)
+        return shapes
 
 
 @dataclass
 class _Discs:
     """What stops rays."""
 
-    numbers: NDArray[np.uint32]  #: of the Gaussians, [n]
-    centers: Array  #: [n, 3] metres
-    axes: Array  #: [n, 2, 3] metres, the semi-axes
+    numbers: UInt32  #: of the Gaussians, [n]
+    centers: Array3f  #: [3, n] metres
+    axes: list[Array3f]  #: two of [3, n] metres, the semi-axes
 
     @staticmethod
-    def of(shapes: _Shapes) -> "_Discs":
-        surfaces, opacity, radius = shapes.surfaces, shapes.opacities, shapes.radius
-        scales = np.maximum(shapes.scales, LEAST_SCALE * radius)
-        reach = np.sqrt(2 * np.log(np.maximum(opacity, OPAQUE) / EDGE))
-        x, y, z = scales.T
-        length2 = np.einsum("ni,ni->n", surfaces.quaternions, surfaces.quaternions, dtype=np.float64)
-        keep = (opacity > OPAQUE) & (length2 > 0) & np.isfinite(length2)
-        keep &= np.maximum(np.maximum(x, y), z) * reach < radius
-        for column, middle in zip(surfaces.means.T, shapes.middle, strict=True):
-            keep &= np.abs(column - middle) < FARTHEST_DISC * radius
-        numbers = np.flatnonzero(keep).astype(np.uint32)
-        x, y, z = (axis[numbers] for axis in (x, y, z))
-        shortest = np.where((x <= y) & (x <= z), 0, np.where(y <= z, 1, 2))
-        turns, place = rotation_from_quaternion(surfaces.quaternions[numbers]), np.arange(len(numbers))
-        axes = np.empty((len(numbers), 2, 3))
-        for i in range(2):
-            longer = i + (shortest <= i)
-            axes[:, i] = turns[place, :, longer] * (scales[numbers, longer] * reach[numbers])[:, None]
-        return _Discs(numbers, surfaces.means[numbers].astype(np.float64), axes)
+    def of(shapes: _Shapes, middle: Array, radius: float) -> "_Discs | None":
+        """middle: [3] of the model, metres, as is its radius. None where nothing stops rays"""
+        opacity, scales = shapes.opacities, dr.maximum(shapes.scales, LEAST_SCALE * radius)
+        reach = dr.sqrt(2 * dr.log(dr.maximum(opacity, OPAQUE) / EDGE))
+        length2 = dr.squared_norm(shapes.quaternions)
+        keep = (opacity > OPAQUE) & (length2 > 0) & dr.isfinite(length2) & (dr.max(scales) * reach < radius)
+        for column, place in zip(shapes.means, middle.tolist(), strict=True):
+            keep &= dr.abs(column - place) < FARTHEST_DISC * radius
+        numbers = cast(UInt32, dr.compress(keep))
+        if not len(numbers):
+            return None
+        centers, scales = (dr.gather(ad.Array3f, vectors, numbers) for vectors in (shapes.means, scales))
+        directions = principal_axes(dr.gather(ad.Array4f, shapes.quaternions, numbers))
+        reach = dr.gather(ad.Float, reach, numbers)
+        x, y, z = (reach * scale * direction for scale, direction in zip(scales, directions, strict=True))
+        is_x, is_z = (scales.x <= scales.y) & (scales.x <= scales.z), scales.z < dr.minimum(scales.x, scales.y)
+        return _Discs(numbers, centers, [dr.select(is_x, y, x), dr.select(is_x | ~is_z, z, y)])
 
 
-def _trace(seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, emitter_of: NDArray[np.uint32]) -> None:
-    """Fill in `Surroundings.seen`. emitter_of: as `_choose` says"""
-    grid = DiscGrid.of(discs.centers, discs.axes)
-    away = np.nan_to_num(np.minimum(AWAY * np.sqrt(shapes.areas), FARTHEST * shapes.radius))
-    place, normal, towards = (_vectors(of) for of in (shapes.surfaces.means, shapes.normals, directions))
-    number_of, emitter = (upload(of, ad.UInt32) for of in (discs.numbers, emitter_of))
-    order = upload(np.argsort(shapes.curve, kind="stable"), ad.UInt32)  # near ones, whose rays take as long, together
-    distance, gaussians = upload(away), dr.opaque(ad.UInt32, len(away))
-    pairs, at_once = len(directions) // 2, max(RAYS_AT_ONCE[select()] // (2 * len(away)), 1)
+def _trace(
+    seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, order: Indices, emitter_of: Indices, radius: float
+) -> None:
+    """Fill in `Surroundings.seen`. order: of the Gaussians, [N], such that near ones, whose rays take as long, follow
+    on each other;  emitter_of: as `_choose` says"""
+    grid, count = DiscGrid.of(discs.centers, discs.axes), len(order)
+    # of areas that are no number, too: nothing
+    distance: Float = dr.select(shapes.areas > 0, AWAY * dr.sqrt(shapes.areas), 0)
+    distance = dr.minimum(distance, FARTHEST * radius)
+    towards, gaussians = upload_rows(directions.T), dr.opaque(ad.UInt32, count)
+    turn, emitter = (upload(numbers, ad.UInt32) for numbers in (order, emitter_of))
+    dr.eval(distance)
+    pairs, at_once = len(directions) // 2, max(RAYS_AT_ONCE[select()] // (2 * count), 1)
     for first in range(0, pairs, at_once):
-        slot = dr.arange(ad.UInt32, min(at_once, pairs - first) * len(away)) + dr.opaque(ad.UInt32, first * len(away))
+        slot = dr.arange(ad.UInt32, min(at_once, pairs - first) * count) + dr.opaque(ad.UInt32, first * count)
         pair, word = slot // gaussians, ad.UInt32(0)
-        index = dr.gather(ad.UInt32, order, slot % gaussians)
+        index = dr.gather(ad.UInt32, turn, slot % gaussians)
         for half in (0, 1):
             direction = dr.gather(ad.Array3f, towards, 2 * pair + half)
-            side = dr.gather(ad.Array3f, normal, index)
+            side = dr.gather(ad.Array3f, shapes.normals, index)
             over = dr.select(dr.dot(side, direction) < 0, -1, 1) * dr.gather(ad.Float, distance, index)
-            start = dr.gather(ad.Array3f, place, index) + over * side
+            start = dr.gather(ad.Array3f, shapes.means, index) + over * side
             disc = grid.first_met(start, direction, dr.isfinite(dr.sum(start)))
             hit = disc != MISSED
-            number = dr.gather(ad.UInt32, number_of, disc, hit)
-            is_back = dr.dot(dr.gather(ad.Array3f, normal, number, hit), direction) > 0
+            number = dr.gather(ad.UInt32, discs.numbers, disc, hit)
+            is_back = dr.dot(dr.gather(ad.Array3f, shapes.normals, number, hit), direction) > 0
             met = dr.gather(ad.UInt32, emitter, number, hit)
             word |= dr.select(hit, 2 * met + dr.select(is_back, ad.UInt32(1), 0), SKY) << (16 * half)
         dr.scatter(seen, word, pair * gaussians + index)
         dr.eval(seen)
 
 
-def _choose(shapes: _Shapes, count: int) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
+def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple[Indices, Indices]:
     """(emitters [count], which of them stands for each Gaussian [N]): of the Gaussians in the order of the axis along
-    which their normals point most, then of `_Shapes.curve`, one in the middle of each of `count` parts of equal area;
-    all, once each, where they are no more. The nearest stands for a Gaussian, by place and normal."""
-    means, normals, total = shapes.surfaces.means, shapes.normals, len(shapes.curve)
+    which their normals point most, then of `order`, one in the middle of each of `count` parts of equal area; all, once
+    each, where they are no more. The nearest stands for a Gaussian, by place and normal."""
+    total = len(order)
     if total <= count:
         return np.resize(np.arange(total, dtype=np.uint32), count), np.arange(total, dtype=np.uint32)
-    area = np.minimum(shapes.areas, (CHOSEN * shapes.radius) ** 2) * shapes.opacities
-    sound = np.isfinite(means).all(axis=1) & (area > 0)
-    if not sound.any():
+    weight = dr.minimum(shapes.areas, (CHOSEN * radius) ** 2) * shapes.opacities
+    is_sound = dr.isfinite(dr.sum(shapes.means)) & (weight > 0)
+    weight, place = dr.select(is_sound, weight, 0), dr.select(is_sound, shapes.means, 0)
+    normal = dr.select(dr.isfinite(shapes.normals), shapes.normals, 0)
+    x, y, z = dr.abs(normal)
+    axis = dr.select((x >= y) & (x >= z), ad.UInt32(0), dr.select(y >= z, ad.UInt32(1), 2))
+    side = 2 * axis + dr.select(dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z)) < 0, 1, 0)
+    dr.eval(weight, place, normal, side)
+    order = order[np.argsort(side.numpy().astype(np.uint8)[order], kind="stable")]
+    ends = np.cumsum(weight.numpy().astype(np.float64)[order])
+    if ends[-1] == 0:
         return np.zeros(count, np.uint32), np.zeros(total, np.uint32)
-    axis = np.abs(normals).argmax(axis=1)
-    points_back = normals[np.arange(total), axis] < 0
-    order = np.argsort(shapes.curve + ((2 * axis + points_back) << 30), kind="stable")
-    ends = np.cumsum(np.where(sound, area, 0)[order])
     middles = (np.arange(count) + 0.5) / count * ends[-1]
     emitters = order[np.searchsorted(ends, middles, side="right")].astype(np.uint32)
-    places = np.hstack([np.where(sound[:, None], means, 0), NORMALS_APART * shapes.radius * normals])
+    places = np.stack([*place.numpy(), *(NORMALS_APART * radius * normal.numpy())], axis=1, dtype=np.float64)
     _, nearest = cKDTree(places[emitters]).query(places, workers=-1)
     return emitters, nearest.astype(np.uint32)
 
 
-def _along_curve(places: Array, side: float) -> NDArray[np.int64]:
-    """[N] see `_Shapes.curve`. places: [N, 3] in a cube of this side with a corner at 0"""
-    spread = np.clip(np.nan_to_num(places * (CELLS / side), posinf=0, neginf=0), 0, CELLS - 1).astype(np.int64)
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        spread = (spread | spread << shift) & mask
-    return spread[:, 0] | spread[:, 1] << 1 | spread[:, 2] << 2
+def _along_curve(means: Array3f, corner: Array, side: float) -> UInt32:
+    """[N] places along a curve through all cells of a cube (Morton 1966): near ones are mostly near on it.
+
+    means: [3, N] metres;  corner: [3] metres, of a cube of this side, metres"""
+    curve = ad.UInt32(0)
+    for axis, (column, low) in enumerate(zip(means, corner.tolist(), strict=True)):
+        cell = (column - low) * (CELLS / side)
+        spread = ad.UInt32(dr.select(cell > 0, dr.minimum(cell, CELLS - 1), 0))
+        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+            spread = (spread | spread << shift) & mask
+        curve |= spread << axis
+    return curve
 
 
 def _middle(surfaces: Surfaces) -> Array:
     """[3] metres: the median of the places that are numbers."""
     means = surfaces.means[np.isfinite(surfaces.means).all(axis=1)].astype(np.float64)
     return np.median(means, axis=0) if len(means) else np.zeros(3)
-
-
-def _unit(normals: NDArray[np.float32]) -> Array:
-    """[N, 3] of unit length; (0, 0, 1) in place of what has no direction."""
-    lengths = np.linalg.norm(normals.astype(np.float64), axis=1, keepdims=True)
-    has_direction = np.isfinite(lengths) & (lengths > 1e-6)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(has_direction, normals / lengths, [0.0, 0.0, 1.0])
-
-
-def _vectors(rows: np.ndarray) -> Array3f:
-    """Array3f [3, N] of [N, 3]."""
-    return ad.Array3f([upload(column) for column in rows.T])

@@ -279,9 +279,10 @@ def _expand(
 
 
 def _pairs_that_fit(boxes: Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
-    """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not."""
+    """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not. No number of a
+    kernel's text, which would be compiled for each."""
     pairs = dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
-    fits = pairs <= capacity
+    fits = pairs <= dr.opaque(ad.UInt64, capacity)
     return fits, ad.UInt32(dr.select(fits, pairs, 0))
 
 

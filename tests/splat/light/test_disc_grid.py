@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from spacesim.backend import ad
-from spacesim.backend.upload import upload
+from spacesim.backend.upload import upload_rows
 from spacesim.splat.light.disc_grid import MISSED, DiscGrid
 
 RAYS = 4000
@@ -62,8 +62,8 @@ def test_the_nearest_is_met_and_of_equally_near_ones_the_first(name, rays):
     if rays == "from outside":
         start -= 5 * towards
     start, towards = (np.float32(rows).astype(np.float64) for rows in (start, towards))
-    place, direction = (ad.Array3f([upload(column) for column in rows.T]) for rows in (start, towards))
-    grid = DiscGrid.of(centers, axes)
+    place, direction = (upload_rows(rows.T) for rows in (start, towards))
+    grid = DiscGrid.of(upload_rows(centers.T), [upload_rows(axis.T) for axis in np.moveaxis(axes, 1, 0)])
     found = np.array(grid.first_met(place, direction, dr.arange(ad.UInt32, RAYS) % 50 != 0))
     expected = first_met(centers, axes, start, towards)
     expected[::50] = MISSED  # rays that are not asked about
