@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -23,6 +24,7 @@ log = logging.getLogger(__name__)
 CACHE_BYTES = 6 * 2**30  #: of decoded pictures, at most
 DEVICE_BYTES = 2 * 2**30  #: of pictures that stay on the device, at most: 512 of 1024 x 1024
 OF_PIXELS = "visibility", "radiance"  #: truth that no mesh can stand in for
+AHEAD, DECODERS = 8, 2  #: pictures that threads decode while a step shows another, and threads
 SHARES = 4, 8  #: a fourth and an eighth of the memory that is free are not exceeded
 
 
@@ -70,9 +72,15 @@ class TrainingViews:
         largest = 4 * self.most_pixels * (1 + sum(3 if name in ("normal", "radiance") else 1 for name in truth))
         self._used = sunlit_frames(dataset) if suns else list(range(len(dataset.train)))
         self._empty: set[int] = set()  # views that have been reported to show nothing
-        self._order = lru_cache(maxsize=1)(self._shuffle)
+        self._order = lru_cache(maxsize=2)(self._shuffle)
         in_memory, on_device = kept_bytes()
-        self._cached = lru_cache(maxsize=max(1, in_memory // largest))(self._load)
+        kept = max(1, in_memory // largest)
+        self._cached = lru_cache(maxsize=kept)(self._take)
+        self._ahead: dict[int, Future[TrainingView]] = {}  # views that are being decoded
+        self._decoded: set[int] = set()
+        # what a mesh gives is computed on the device, and what is not kept would be decoded for nothing
+        reads_ahead = surface is None and kept >= len(self._used)
+        self._decoders = ThreadPoolExecutor(DECODERS, "decode") if reads_ahead else None
         self._device_cache = lru_cache(maxsize=max(1, on_device // largest))(self._upload)
 
     def __len__(self) -> int:
@@ -84,8 +92,18 @@ class TrainingViews:
     def at_step(self, step: int) -> TrainingView:
         """The view of a step: every epoch visits all views that are used once, in an order that (seed, epoch)
         decides."""
+        if self._decoders and len(self._decoded) < len(self._used):
+            for later in range(step, step + AHEAD):
+                index = self._shown(later)
+                if index not in self._decoded:
+                    self._decoded.add(index)
+                    self._ahead[index] = self._decoders.submit(self._load, index)
+        return self[self._shown(step)]
+
+    def _shown(self, step: int) -> int:
+        """Index of the view of a step."""
         epoch, place = divmod(step, len(self._used))
-        return self[int(self._order(epoch)[place])]
+        return int(self._order(epoch)[place])
 
     def pixels(self, view: TrainingView) -> tuple[UInt32, Bool, TruthPlanes]:
         """(rgba UInt32 [H * W], valid Bool [H * W] or of width 1, truth as Floats [H * W]) of a view."""
@@ -100,6 +118,11 @@ class TrainingViews:
 
     def _shuffle(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([self.seed, 1, epoch]).permutation(self._used)
+
+    def _take(self, index: int) -> TrainingView:
+        self._decoded.add(index)
+        ahead = self._ahead.pop(index, None)
+        return self._load(index) if ahead is None else ahead.result()
 
     def _load(self, index: int) -> TrainingView:
         frame = self.dataset.train[index]
