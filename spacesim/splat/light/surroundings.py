@@ -38,6 +38,7 @@ FARTHEST_DISC = 4.0  #: of the model's radius: what is farther away from its mid
 CHOSEN = 0.1  #: of the model's radius: a Gaussian counts no more for the choice of emitters than one of this size
 NORMALS_APART = 0.05  #: of the model's radius: how much a normal counts beside a place where the nearest is sought
 CELLS = 1 << 10  #: on a side of the model, along whose curve emitters are chosen
+SOME = 10_000  #: Gaussians that say where the middle of a model is
 SKY = 0xFFFF  #: of `Surroundings.seen`: nothing
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
 
@@ -114,8 +115,7 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
     shapes = _Shapes.of(surfaces)
     middle = _middle(surfaces)
-    curve = _along_curve(shapes.means, middle - 2 * radius, 4 * radius).numpy()
-    order = np.argsort(curve, kind="stable")
+    order = _order(shapes, middle, radius)
     numbers, emitter_of = _choose(shapes, order, emitters, radius)
     seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * len(surfaces.means))
     discs = _Discs.of(shapes, middle, radius)
@@ -186,8 +186,8 @@ class _Discs:
 def _trace(
     seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, order: Indices, emitter_of: Indices, radius: float
 ) -> None:
-    """Fill in `Surroundings.seen`. order: of the Gaussians, [N], such that near ones, whose rays take as long, follow
-    on each other;  emitter_of: as `_choose` says"""
+    """Fill in `Surroundings.seen`. order: of `_order`: rays that follow on each other take as long;  emitter_of: as
+    `_choose` says"""
     grid, count = DiscGrid.of(discs.centers, discs.axes), len(order)
     # of areas that are no number, too: nothing
     distance: Float = dr.select(shapes.areas > 0, AWAY * dr.sqrt(shapes.areas), 0)
@@ -215,10 +215,30 @@ def _trace(
         dr.eval(seen)
 
 
+def _order(shapes: _Shapes, middle: Array, radius: float) -> Indices:
+    """[N] the Gaussians by the axis along which their normals point most, then along a curve through all cells of a
+    cube about the model (Morton 1966): near ones are mostly near in it. middle: [3] of the model, metres, as is its
+    radius"""
+    normal = shapes.normals
+    x, y, z = dr.abs(normal)
+    axis = dr.select((x >= y) & (x >= z), ad.UInt32(0), dr.select(y >= z, ad.UInt32(1), 2))
+    side = 2 * axis + dr.select(dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z)) < 0, 1, 0)
+    curve = ad.UInt32(0)
+    for number, (column, place) in enumerate(zip(shapes.means, middle.tolist(), strict=True)):
+        cell = (column - place) * (CELLS / (4 * radius)) + CELLS / 2
+        spread = ad.UInt32(dr.select(cell > 0, dr.minimum(cell, CELLS - 1), 0))
+        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+            spread = (spread | spread << shift) & mask
+        curve |= spread << number
+    dr.eval(side, curve)
+    keys = side.numpy().astype(np.uint64) << np.uint64(61) | curve.numpy().astype(np.uint64) << np.uint64(31)
+    return np.sort(keys | np.arange(len(keys), dtype=np.uint64)) & np.uint64(0x7FFFFFFF)
+
+
 def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple[Indices, Indices]:
-    """(emitters [count], which of them stands for each Gaussian [N]): of the Gaussians in the order of the axis along
-    which their normals point most, then of `order`, one in the middle of each of `count` parts of equal area; all, once
-    each, where they are no more. The nearest stands for a Gaussian, by place and normal."""
+    """(emitters [count], which of them stands for each Gaussian [N]): one in the middle of each of `count` parts of
+    equal area of the Gaussians in their `order`; all, once each, where they are no more. The nearest stands for a
+    Gaussian, by place and normal."""
     total = len(order)
     if total <= count:
         return np.resize(np.arange(total, dtype=np.uint32), count), np.arange(total, dtype=np.uint32)
@@ -226,12 +246,8 @@ def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple
     is_sound = dr.isfinite(dr.sum(shapes.means)) & (weight > 0)
     weight, place = dr.select(is_sound, weight, 0), dr.select(is_sound, shapes.means, 0)
     normal = dr.select(dr.isfinite(shapes.normals), shapes.normals, 0)
-    x, y, z = dr.abs(normal)
-    axis = dr.select((x >= y) & (x >= z), ad.UInt32(0), dr.select(y >= z, ad.UInt32(1), 2))
-    side = 2 * axis + dr.select(dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z)) < 0, 1, 0)
-    dr.eval(weight, place, normal, side)
-    order = order[np.argsort(side.numpy().astype(np.uint8)[order], kind="stable")]
-    ends = np.cumsum(weight.numpy().astype(np.float64)[order])
+    dr.eval(weight, place, normal)
+    ends = np.cumsum(weight.numpy()[order], dtype=np.float64)
     if ends[-1] == 0:
         return np.zeros(count, np.uint32), np.zeros(total, np.uint32)
     middles = (np.arange(count) + 0.5) / count * ends[-1]
@@ -241,21 +257,8 @@ def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple
     return emitters, nearest.astype(np.uint32)
 
 
-def _along_curve(means: Array3f, corner: Array, side: float) -> UInt32:
-    """[N] places along a curve through all cells of a cube (Morton 1966): near ones are mostly near on it.
-
-    means: [3, N] metres;  corner: [3] metres, of a cube of this side, metres"""
-    curve = ad.UInt32(0)
-    for axis, (column, low) in enumerate(zip(means, corner.tolist(), strict=True)):
-        cell = (column - low) * (CELLS / side)
-        spread = ad.UInt32(dr.select(cell > 0, dr.minimum(cell, CELLS - 1), 0))
-        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-            spread = (spread | spread << shift) & mask
-        curve |= spread << axis
-    return curve
-
-
 def _middle(surfaces: Surfaces) -> Array:
-    """[3] metres: the median of the places that are numbers."""
-    means = surfaces.means[np.isfinite(surfaces.means).all(axis=1)].astype(np.float64)
+    """[3] metres: the median of the places that are numbers, of some of many."""
+    means = surfaces.means[:: max(len(surfaces.means) // SOME, 1)]
+    means = means[np.isfinite(means).all(axis=1)].astype(np.float64)
     return np.median(means, axis=0) if len(means) else np.zeros(3)
