@@ -428,7 +428,8 @@ def test_materials_of_a_run(spacesim, tiny_data, tmp_path):
     short = ("--iterations", 40, "--set", "init_count=300", "--preset", "demo", "--method", "relight")
     assert spacesim("train", tmp_path / "data", "--out", tmp_path / "run", *short).code == 0
     view = load_run(tmp_path / "run").draw_material(read_dataset(tmp_path / "data").frames[3].camera)
-    for kind, shape in (("albedo", (40, 40, 3)), ("roughness", (40, 40)), ("metallic", (40, 40))):
+    shapes = {"albedo": (40, 40, 3), "specular": (40, 40, 3), "roughness": (40, 40), "metallic": (40, 40)}
+    for kind, shape in shapes.items():
         for suffix in ("png", "exr"):
             out = tmp_path / f"{kind}.{suffix}"
             done = spacesim("render", tmp_path / "run", "--frame", 3, "--kind", kind, "--out", out)
@@ -703,6 +704,7 @@ def test_a_setting_that_cannot_be_is_named(spacesim, tiny_data, tmp_path, words,
         ("render RUN --out OUT.png --camera DATA/scene.json", ["scene.json", "w and h"]),
         ("render RUN --out OUT.png --kind shade", ["--kind", "shade"]),
         ("render RUN --out OUT.png --kind shadow", ["--kind: expected another than shadow"]),
+        ("render RUN --out OUT.png --kind albedo --exposure 1", ["--exposure: expected none with --kind albedo"]),
         ("render RUN --out OUT.png --kind albedo", ["RUN", "to read materials, found one of vanilla"]),
         ("sweep RUN --out OUT", ["RUN", "vanilla"]),
         ("render RUN --out OUT.png --sun 5", ["--sun", "5"]),

@@ -8,6 +8,7 @@ from pathlib import Path
 from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, angles_or_none, view_of
 from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE
+from spacesim.data.errors import InputError
 from spacesim.data.integrity.manifest import check_unlisted
 from spacesim.learning.prediction import KINDS, MATERIAL_KINDS
 
@@ -39,6 +40,8 @@ def run(options: argparse.Namespace) -> None:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
     camera, of_frame = view_of(options, run)
     if options.kind in MATERIAL_KINDS:
+        if options.exposure is not None:
+            raise InputError(f"--exposure: expected none with --kind {options.kind}, which no light changes")
         write_material(run.draw_material(camera), options.kind, options.out)
         if lit and lit.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)

@@ -44,14 +44,14 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
 
 
 def write_material(view: MaterialView, kind: str, path: Path) -> None:
-    """kind: "albedo" (PNG: as sRGB values, straight alpha; EXR: linear), "roughness" or "metallic". Raises InputError
-    for another suffix than .png or .exr."""
+    """kind: "albedo", "specular" (PNG: as sRGB values, straight alpha; EXR: linear), "roughness" or "metallic". Raises
+    InputError for another suffix than .png or .exr."""
     plane = np.asarray(getattr(view, kind))
     if path.suffix == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})
     elif path.suffix != ".png":
         raise _neither_png_nor_exr(path)
-    elif kind == "albedo":
+    elif plane.ndim == 3:
         alpha = np.clip(view.alpha, 0, 1)[..., None]
         write_png(path, as_bytes(np.concatenate([srgb_from_linear(plane), alpha], axis=-1)))
     else:

@@ -15,7 +15,12 @@ more until it is written."""
 
 
 KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction
-MATERIAL_KINDS = ("albedo", "roughness", "metallic")  #: of pictures of a `MaterialView`, which no Sun changes
+MATERIAL_KINDS = (
+    "albedo",
+    "specular",
+    "roughness",
+    "metallic",
+)  #: of a `MaterialView`, which no Sun changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,7 @@ class MaterialView:
     metallic: np.ndarray  #: [H, W] share of metals, in [0, 1]
     normal: np.ndarray  #: [H, W, 3] unit vectors in world axes, of the learned normals
     alpha: np.ndarray  #: [H, W]
+    specular: np.ndarray  #: [H, W, 3] linear reflectance of facets at normal incidence, 0 where none are seen
 
     def __repr__(self) -> str:
         return planes_repr(self, self.alpha.shape[1], self.alpha.shape[0])

@@ -77,6 +77,12 @@ class Rendering:
         return self._material.albedo
 
     @property
+    def specular(self) -> np.ndarray:
+        """[H, W, 3] float32: linear reflectance of facets at normal incidence, 0 where none are seen, of a run that
+        `Run.draw_material` takes."""
+        return self._material.specular
+
+    @property
     def roughness(self) -> np.ndarray:
         """[H, W] float32: alpha of GGX, 1 where no gloss is seen, of a run that `Run.draw_material` takes."""
         return self._material.roughness
@@ -93,8 +99,8 @@ class Rendering:
     def save(self, path: str | Path, kind: str = "rgb") -> Path:
         """Write a PNG to look at or an EXR to compute with; returns its path.
 
-        kind: "rgb", "alpha", "depth", "normal", "shadow", "albedo", "roughness" or "metallic". Raises InputError for
-        another, for another suffix, and for what a method is without.
+        kind: "rgb", "alpha", "depth", "normal", "shadow", "albedo", "specular", "roughness" or "metallic". Raises
+        InputError for another, for another suffix, and for what a method is without.
         """
         path = as_path(path, "path")
         if kind not in (*KINDS, *MATERIAL_KINDS):

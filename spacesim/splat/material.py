@@ -60,7 +60,8 @@ def draw_material(
 ) -> MaterialView:
     """What a camera sees of the materials and learned normals ([N, 3] world axes, of any length) of Gaussians."""
     check_picture(camera)
-    planes = [*upload_rows(material.albedo.T), upload(material.roughness), upload(material.metallic)]
+    colors = [*upload_rows(material.albedo.T), *upload_rows(material.specular.T)]
+    planes = [*colors, upload(material.roughness), upload(material.metallic)]
     learned = unit_normals(upload_rows(normals.T))
 
     def draw(seen: Pinhole) -> RenderOutput:
@@ -69,9 +70,10 @@ def draw_material(
 
     output = render_supersampled(draw, camera, supersample)
     assert output.features is not None
-    straight = [over_alpha(plane, output.alpha) for plane in output.features[:5]]
-    shown = planes_image([*straight, *unit(ad.Array3f(output.features[5:]))], camera.width, camera.height)
-    return MaterialView(shown[..., :3], shown[..., 3], shown[..., 4], shown[..., 5:], output.image("alpha"))
+    straight = [over_alpha(plane, output.alpha) for plane in output.features[:8]]
+    shown = planes_image([*straight, *unit(ad.Array3f(output.features[8:]))], camera.width, camera.height)
+    roughness, metallic, alpha = shown[..., 6], shown[..., 7], output.image("alpha")
+    return MaterialView(shown[..., :3], roughness, metallic, shown[..., 8:], alpha, shown[..., 3:6])
 
 
 def no_material(path: Path, found: str) -> InputError:

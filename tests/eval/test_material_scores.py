@@ -39,7 +39,8 @@ def reading(make_run, albedo: float = 0.1):
     def draw_material(camera):
         size = camera.height, camera.width
         normal = np.tile([np.sqrt(0.75), 0, 0.5], (*size, 1))
-        return MaterialView(np.full((*size, 3), albedo), np.ones(size), np.zeros(size), normal, np.ones(size))
+        colors = np.full((*size, 3), albedo)
+        return MaterialView(colors, np.ones(size), np.zeros(size), normal, np.ones(size), 0 * colors)
 
     run.draw_material = draw_material
     return run

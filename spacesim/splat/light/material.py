@@ -41,11 +41,12 @@ class FittedMaterial:
     albedo: np.ndarray
     metallic: np.ndarray  #: [N] 1 of metals, 0 of others
     roughness: np.ndarray  #: [N] alpha of GGX, 1 where no facets are seen
+    specular: np.ndarray  #: [N, 3] what facets reflect at normal incidence: a metal's albedo; 0 where none are seen
 
     @staticmethod
     def joined(materials: "Sequence[FittedMaterial]") -> "FittedMaterial":
         """Of one set of Gaussians after another."""
-        rows = ((each.albedo, each.metallic, each.roughness) for each in materials)
+        rows = ((each.albedo, each.metallic, each.roughness, each.specular) for each in materials)
         return FittedMaterial(*(np.concatenate(parts) for parts in zip(*rows, strict=True)))
 
 
@@ -128,7 +129,7 @@ def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> Fit
     count = reflected.shape[2]
     light = np.moveaxis(reflected, 0, 2).reshape(3 * count, -1)
     weights = np.moveaxis(known, 0, 2).reshape(3 * count, -1) / (np.maximum(light, 0) + FAINT) ** 2
-    least, albedo = np.full(count, np.inf), np.zeros((3, count))
+    least, albedo, facets = np.full(count, np.inf), np.zeros((3, count)), np.zeros((3, count))
     metallic, roughness = np.zeros(count), np.ones(count)
     for kind in _surfaces(angles):
         fitted = _fit_lobes(light - kind.rest, weights, kind.lambert, kind.facets, kind.most)
@@ -138,9 +139,9 @@ def fit_material(angles: SunAndView, reflected: Array, known: np.ndarray) -> Fit
         if kind.is_metal:
             better &= tried.max(axis=0) >= LEAST_METAL
         least, albedo = np.where(better, error, least), np.where(better, tried, albedo)
-        metallic = np.where(better, kind.is_metal, metallic)
+        facets, metallic = np.where(better, specular, facets), np.where(better, kind.is_metal, metallic)
         roughness = np.where(better, kind.roughness, roughness)
-    return FittedMaterial(*(np.float32(values.T) for values in (albedo, metallic, roughness)))
+    return FittedMaterial(*(np.float32(values.T) for values in (albedo, metallic, roughness, facets)))
 
 
 @dataclass(frozen=True, eq=False)

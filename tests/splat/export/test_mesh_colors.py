@@ -135,7 +135,9 @@ def test_materials_in_gltf_are_lit(tmp_path):
 
 def test_a_picture_of_materials_has_five_channels():
     planes = np.full((2, 3), 0.3), np.full((2, 3), 0.9)
-    view = MaterialView(np.full((2, 3, 3), 0.5), *planes, np.zeros((2, 3, 3)), np.full((2, 3), 0.5))
+    view = MaterialView(
+        np.full((2, 3, 3), 0.5), *planes, np.zeros((2, 3, 3)), np.full((2, 3), 0.5), np.zeros((2, 3, 3))
+    )
     shown = color_of_material(view)
     np.testing.assert_allclose(shown.rgb / 0.5, np.tile([*srgb_of(np.full(3, 0.5)), 0.3, 0.9], (2, 3, 1)), atol=1e-6)
     centres, mesh = [np.zeros(3)], spheres(np.zeros(3))

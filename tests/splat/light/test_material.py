@@ -91,6 +91,7 @@ def test_known_materials_come_back():
     light = answers(angles, KNOWN)
     found = fit_material(angles, light, np.ones_like(light, bool))
     np.testing.assert_allclose(found.albedo, [KNOWN[0][0], KNOWN[1][1], KNOWN[2][0]], atol=2e-4)
+    np.testing.assert_allclose(found.specular, [known[1] for known in KNOWN], atol=2e-4)
     assert found.metallic.tolist() == [0, 1, 0]
     np.testing.assert_allclose(found.roughness, [known[2] for known in KNOWN])
 
@@ -110,6 +111,7 @@ def test_a_lambertian_surface_has_no_gloss():
     found = fit_material(angles, light, np.ones_like(light, bool))
     np.testing.assert_allclose(found.albedo, np.tile([[0.02], [0.5], [0.95]], 3), rtol=1e-6)
     assert not found.metallic.any()
+    assert not found.specular.any()
     assert (found.roughness == 1).all()
 
 
@@ -193,7 +195,7 @@ def test_materials_do_not_depend_on_where_normals_point(run):
     turned = run.gaussians.to_numpy()
     turned["features"][:, 4:7] = np.random.default_rng(8).normal(size=(30, 3))
     other = read_material(Gaussians.from_numpy(turned), run.light, np.ones(3), "srgb")
-    for name in ("albedo", "metallic", "roughness"):
+    for name in ("albedo", "metallic", "roughness", "specular"):
         assert np.array_equal(getattr(run.material, name), getattr(other, name))
     assert np.ptp(other.albedo) > 0
     assert run.albedo_is_relative
@@ -201,18 +203,22 @@ def test_materials_do_not_depend_on_where_normals_point(run):
 
 def test_a_picture_of_one_material_shows_it_wherever_there_is_something(run):
     albedo = np.tile(np.float32([0.5, 0.4, 0.3]), (30, 1))
-    run.__dict__["material"] = FittedMaterial(albedo, np.ones(30, np.float32), np.full(30, 0.25, np.float32))
+    run.__dict__["material"] = FittedMaterial(
+        albedo, np.ones(30, np.float32), np.full(30, 0.25, np.float32), albedo / 2
+    )
     view = run.draw_material(CAMERA)
     seen = view.alpha > 0
     assert seen.any()
     assert not seen.all()
     np.testing.assert_allclose(view.albedo[seen], np.tile([0.5, 0.4, 0.3], (seen.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(view.specular[seen], view.albedo[seen] / 2, atol=1e-5)
     np.testing.assert_allclose(view.metallic[seen], 1, atol=1e-5)
     np.testing.assert_allclose(view.roughness[seen], 0.25, atol=1e-5)
     assert not view.albedo[~seen].any()
     np.testing.assert_allclose(np.linalg.norm(view.normal[seen], axis=-1), 1, atol=1e-4)
     rendering = run.render(CAMERA, sun=(0, 0))
     assert np.array_equal(rendering.albedo, view.albedo)
+    assert np.array_equal(rendering.specular, view.specular)
     assert np.array_equal(rendering.roughness, view.roughness)
     assert np.array_equal(rendering.metallic, view.metallic)
 
