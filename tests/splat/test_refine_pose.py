@@ -40,8 +40,9 @@ def run(known_gaussians) -> Run:
 
 @pytest.fixture(scope="module")
 def lit_run(known_gaussians) -> Run:
-    """In the light of networks that nobody has trained; normals at random would mirror a new colour from each side."""
-    many = {"light.field.features": 16, "light.bounce": 0}  # so that colours differ
+    """In the light of networks that nobody has trained, with a bounce; mirrors at random would show a new colour from
+    each side."""
+    many = {"light.field.features": 16, "light.bounce": 64, "light.gloss": False}  # so that colours differ
     config, rng = with_settings(preset("demo", "shadow-map"), many).light, np.random.default_rng(3)
     dark = {**known_gaussians, "sh": np.zeros((60, 0, 3)), "features": 2 * rng.normal(size=(60, config.features))}
     return run_of(Gaussians.from_numpy(dark), LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 3.0, 0.8), 0))

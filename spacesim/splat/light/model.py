@@ -29,7 +29,7 @@ from spacesim.splat.light.shading import ShadingInputs, ShadingTape, split_weigh
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
-from spacesim.splat.light.surroundings import Surfaces, Surroundings, look_around, ray_count
+from spacesim.splat.light.surroundings import HeldSurroundings, Surfaces, Surroundings, look_around, ray_count
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
@@ -144,7 +144,8 @@ class LightModel:
         self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
         self._cache = _PictureCache([], None, [], [])
         self._around = _Around([], None)
-        self._held: Surfaces | None = None
+        self._held: HeldSurroundings | None = None
+        self._told = False  # that rays take long in training
         self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
 
     @staticmethod
@@ -201,32 +202,44 @@ class LightModel:
         """What these see around them, or saw at the last `hold_surroundings`; None for a model without a bounce."""
         if not self.config.bounce or gaussians.count == 0:
             return None
-        if self._held and len(self._held.means) != gaussians.count:
-            raise ValueError(f"surroundings: held for {len(self._held.means)} Gaussians, found {gaussians.count}")
-        read = [] if self._held else [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
+        if self._held:
+            if not self._told:
+                self._told = self._tell_of_rays(gaussians.count, "now and then in training")
+            return self._held.surroundings(self.config.bounce, self.frame.radius, gaussians.count)
+        read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
         if self._around.surroundings is None or not _are_same(read, self._around.read):
-            surfaces = self._held or self._surfaces(gaussians)
             self._around = _Around([], None)  # frees memory for the next
-            rays = gaussians.count * ray_count(self.config.bounce)
-            if select() == "llvm" and rays > MANY_RAYS and not self._held:
-                log.info("light that bounces: %.0f million rays are traced, once for all pictures", rays / 1e6)
+            self._tell_of_rays(gaussians.count, "once for all pictures")
+            surfaces = Surfaces.of(gaussians, self.config.field.features)
             self._around = _Around(_kept(read), look_around(surfaces, self.config.bounce, self.frame.radius))
         return self._around.surroundings
 
-    def hold_surroundings(self, of: Gaussians | Surfaces | None) -> None:
-        """In training Gaussians move in each step: light bounces as if they stood where these do, as many as they are,
-        until this is called again. None: where they stand"""
-        self._held = self._surfaces(of) if isinstance(of, Gaussians) else of
-        self._around = _Around([], None)
+    def _tell_of_rays(self, count: int, when: str) -> bool:
+        """Of so many Gaussians, where they take long. Returns whether they do."""
+        rays = count * ray_count(self.config.bounce)
+        takes_long = select() == "llvm" and rays > MANY_RAYS
+        if takes_long:
+            log.info("light that bounces: %.0f million rays are traced, %s", rays / 1e6, when)
+        return takes_long
+
+    def hold_surroundings(self, of: Gaussians | HeldSurroundings) -> None:
+        """In training Gaussians move in each step, and come and go (`follow`): light bounces as if they stood where
+        these do, or those of a checkpoint, until this is called again."""
+        if isinstance(of, Gaussians):
+            of = HeldSurroundings(Surfaces.of(of, self.config.field.features))
+        self._held, self._around = of, _Around([], None)
         self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # its emitters have other numbers
 
+    def follow(self, source: UInt32) -> None:
+        """Each Gaussian was `source` [N] of those before: it sees what that one saw."""
+        if self._held:
+            self._held.follow(source)
+            self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
+
     @property
-    def held_surfaces(self) -> Surfaces | None:
+    def held_surroundings(self) -> HeldSurroundings | None:
         """Of the last `hold_surroundings`."""
         return self._held
-
-    def _surfaces(self, gaussians: Gaussians) -> Surfaces:
-        return Surfaces.of(gaussians, self.config.field.features)
 
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for

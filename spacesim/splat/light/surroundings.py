@@ -2,7 +2,7 @@
 
 Light that bounces comes along these rays (`bounce`), so that what stands in between hides it, and what overlaps counts
 once. To rays, Gaussians are discs across their two longer axes. They are traced when a model is first lit, and in
-training each time that Gaussians come or go, and now and then (`are_due`).
+training now and then (`are_due`): in between, Gaussians that come see what those see that they were made of.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Array3f, Array4f, Float, UInt32
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.learning.reflectance import unit_normals
@@ -23,9 +23,9 @@ from spacesim.splat.light.disc_grid import MISSED, DiscGrid
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.raster.records import packets, store
 
-#: steps of training after which rays are traced anew: the first ones, and each so many from the last of them on, which
-#: none of them is near an opacity reset, after which rays meet nothing
-FIRST, EVERY = (50, 100, 200), 500
+#: steps of training after which rays are traced anew: the first, then each so many, and from `EARLY` on each so many
+FIRST, OFTEN, EARLY, RARELY = 50, 100, 1000, 500
+RECOVERY = 200  #: steps after an opacity reset until most opacities stop rays again
 MOST_RAYS = 512  #: from each Gaussian; docs/research/light.md
 LEAST_RAYS = 128  #: from each Gaussian
 EMITTERS_PER_RAY = 8  #: while that makes neither more nor fewer rays
@@ -38,8 +38,11 @@ FARTHEST_DISC = 4.0  #: of the model's radius: what is farther away from its mid
 CHOSEN = 0.1  #: of the model's radius: a Gaussian counts no more for the choice of emitters than one of this size
 NORMALS_APART = 0.05  #: of the model's radius: how much a normal counts beside a place where the nearest is sought
 CELLS = 1 << 10  #: on a side of the model, along whose curve emitters are chosen
+MIDDLE_STEP = 0.25  #: of the model's radius: the curve's cube moves by so much at least
 SOME = 10_000  #: Gaussians that say where the middle of a model is
 SKY = 0xFFFF  #: of `Surroundings.seen`: nothing
+SOURCE = "surfaces.source"  #: in checkpoints
+GONE = 0xFFFFFFFF  #: in place of a Gaussian's number
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
 
 
@@ -73,13 +76,14 @@ class Surfaces:
         return {f"surfaces.{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @staticmethod
-    def from_tensors(tensors: Mapping[str, np.ndarray], count: int) -> "Surfaces | None":
-        """The inverse of `tensors`, of so many; None where a checkpoint holds none. Raises KeyError where some are
-        missing, ValueError where shapes do not fit."""
+    def from_tensors(tensors: Mapping[str, np.ndarray]) -> "Surfaces | None":
+        """The inverse of `tensors`; None where a checkpoint holds none. Raises KeyError where some are missing,
+        ValueError where shapes do not fit."""
         if not any(name.startswith("surfaces.") for name in tensors):
             return None
         shapes = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logit_opacities": (), "normals": (3,)}
         values = {name: tensors[f"surfaces.{name}"] for name in shapes}
+        count = len(values["means"])
         for name, shape in shapes.items():
             if values[name].shape != (count, *shape):
                 raise ValueError(f"surfaces.{name}: expected {(count, *shape)}, found {values[name].shape}")
@@ -96,10 +100,87 @@ class Surroundings:
     seen: UInt32
     directions: list[Float]  #: of two rays a record, see `records.load`
 
+    def of(self, source: UInt32, count: int) -> "Surroundings":
+        """What Gaussians see each of which was `source` [M] of the `count` that saw this. One that emits and has gone
+        does so from the place of the emitter before it, which is mostly near."""
+        sources = source.numpy()
+        first = np.full(count, GONE, np.uint32)
+        first[sources[::-1]] = np.arange(len(sources), dtype=np.uint32)[::-1]
+        emitters = first[self.emitters.numpy()]
+        left = np.flatnonzero(emitters != GONE)
+        if len(left):
+            emitters = emitters[left[np.maximum(np.searchsorted(left, np.arange(len(emitters)), side="right") - 1, 0)]]
+        else:
+            emitters[:] = 0
+        pairs, before, now = (
+            dr.width(self.seen) // count,
+            dr.opaque(ad.UInt32, count),
+            dr.opaque(ad.UInt32, len(sources)),
+        )
+        slot = dr.arange(ad.UInt32, pairs * len(sources))
+        seen = dr.gather(ad.UInt32, self.seen, slot // now * before + dr.gather(ad.UInt32, source, slot % now))
+        dr.eval(seen)
+        return Surroundings(upload(emitters, ad.UInt32), seen, self.directions)
+
+
+class HeldSurroundings:
+    """What Gaussians saw when rays were traced last, for them and those that they have become.
+
+    surfaces: what rays met, M
+    source: which of the M each Gaussian was, UInt32 [N]; None: there are still the same
+    """
+
+    def __init__(self, surfaces: Surfaces, source: UInt32 | None = None) -> None:
+        self.surfaces, self.source = surfaces, source
+        self._traced: Surroundings | None = None
+        self._now: Surroundings | None = None
+
+    @property
+    def count(self) -> int:
+        """Gaussians now, N."""
+        return len(self.surfaces.means) if self.source is None else dr.width(self.source)
+
+    def follow(self, source: UInt32) -> None:
+        """Each Gaussian was `source` [N] of those before."""
+        self.source = source if self.source is None else dr.gather(ad.UInt32, self.source, source)
+        dr.eval(self.source)
+        self._now = None
+
+    def surroundings(self, emitters: int, radius: float, count: int) -> Surroundings:
+        """Of so many Gaussians; rays are traced at the first call. emitters, radius: see `look_around`. Raises
+        ValueError where these are others."""
+        if self.count != count:
+            raise ValueError(f"surroundings: held for {self.count} Gaussians, found {count}")
+        if self._traced is None:
+            self._traced = look_around(self.surfaces, emitters, radius)
+        if self._now is None:
+            all_of = self._traced
+            self._now = all_of if self.source is None else all_of.of(self.source, len(self.surfaces.means))
+        return self._now
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        """For a checkpoint."""
+        return self.surfaces.tensors() | (
+            {} if self.source is None else {SOURCE: self.source.numpy().astype(np.float64)}
+        )
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, np.ndarray], count: int) -> "HeldSurroundings | None":
+        """The inverse of `tensors`, of so many Gaussians; None where a checkpoint holds none. Raises KeyError where
+        some are missing, ValueError where they do not fit."""
+        surfaces = Surfaces.from_tensors(tensors)
+        if surfaces is None:
+            return None
+        total, source = len(surfaces.means), tensors.get(SOURCE)
+        expected, found = (count,), (total,) if source is None else source.shape
+        if found != expected or (source is not None and not ((source >= 0) & (source < total)).all()):
+            raise ValueError(f"{SOURCE}: expected {count} numbers of {total} Gaussians, found others")
+        return HeldSurroundings(surfaces, None if source is None else upload(source, ad.UInt32))
+
 
 def are_due(step: int) -> bool:
     """Whether rays are traced anew after so many steps, the first time before the first."""
-    return step in FIRST or step % EVERY == FIRST[-1]
+    return step == FIRST or step % (OFTEN if step < EARLY else RARELY) == 0
 
 
 def ray_count(emitters: int) -> int:
@@ -113,14 +194,13 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     pairs = len(directions) // 2
     rows = [upload(row) for row in directions.reshape(pairs, 6).T]
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
-    shapes = _Shapes.of(surfaces)
-    middle = _middle(surfaces)
-    order = _order(shapes, middle, radius)
-    numbers, emitter_of = _choose(shapes, order, emitters, radius)
+    shapes = _Shapes.of(surfaces, radius)
+    order = _order(shapes)
+    numbers, emitter_of = _choose(shapes, order, emitters)
     seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * len(surfaces.means))
-    discs = _Discs.of(shapes, middle, radius)
+    discs = _Discs.of(shapes)
     if discs is not None:
-        _trace(seen, shapes, discs, directions, order, emitter_of, radius)
+        _trace(seen, shapes, discs, directions, order, emitter_of)
     result = Surroundings(upload(numbers, ad.UInt32), seen, packed)
     dr.eval(result)
     return result
@@ -130,7 +210,10 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
 class _Shapes:
     """N surfaces as tracing takes them."""
 
+    radius: float  #: of the model, metres
+    middle: list[float]  #: of the model, metres
     means: Array3f  #: [3, N] metres
+    is_part: Bool  #: [N] of the model, and not far away
     scales: Array3f  #: [3, N] metres
     quaternions: Array4f  #: [4, N]
     opacities: Float  #: [N] in [0, 1]; 0 of what is no number
@@ -138,13 +221,18 @@ class _Shapes:
     areas: Float  #: [N] m^2: the product of the two longer scales
 
     @staticmethod
-    def of(surfaces: Surfaces) -> "_Shapes":
+    def of(surfaces: Surfaces, radius: float) -> "_Shapes":
+        middle = _middle(surfaces).tolist()
         rows = (surfaces.means, surfaces.log_scales, surfaces.normals)
         means, log_scales, normals = (upload_rows(values.T) for values in rows)
         scales, opacity = dr.exp(log_scales), opacities(upload(surfaces.logit_opacities))
         x, y, z = scales
+        away = [dr.abs(column - place) for column, place in zip(means, middle, strict=True)]
         shapes = _Shapes(
+            radius,
+            middle,
             means,
+            dr.maximum(dr.maximum(away[0], away[1]), away[2]) < FARTHEST_DISC * radius,
             scales,
             ad.Array4f([upload(row) for row in surfaces.quaternions.T]),
             dr.select(dr.isfinite(opacity), opacity, 0),
@@ -164,14 +252,13 @@ class _Discs:
     axes: list[Array3f]  #: two of [3, n] metres, the semi-axes
 
     @staticmethod
-    def of(shapes: _Shapes, middle: Array, radius: float) -> "_Discs | None":
-        """middle: [3] of the model, metres, as is its radius. None where nothing stops rays"""
-        opacity, scales = shapes.opacities, dr.maximum(shapes.scales, LEAST_SCALE * radius)
+    def of(shapes: _Shapes) -> "_Discs | None":
+        """None where nothing stops rays."""
+        opacity, scales = shapes.opacities, dr.maximum(shapes.scales, LEAST_SCALE * shapes.radius)
         reach = dr.sqrt(2 * dr.log(dr.maximum(opacity, OPAQUE) / EDGE))
         length2 = dr.squared_norm(shapes.quaternions)
-        keep = (opacity > OPAQUE) & (length2 > 0) & dr.isfinite(length2) & (dr.max(scales) * reach < radius)
-        for column, place in zip(shapes.means, middle.tolist(), strict=True):
-            keep &= dr.abs(column - place) < FARTHEST_DISC * radius
+        keep = shapes.is_part & (opacity > OPAQUE) & (length2 > 0) & dr.isfinite(length2)
+        keep &= dr.max(scales) * reach < shapes.radius
         numbers = cast(UInt32, dr.compress(keep))
         if not len(numbers):
             return None
@@ -184,14 +271,14 @@ class _Discs:
 
 
 def _trace(
-    seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, order: Indices, emitter_of: Indices, radius: float
+    seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, order: Indices, emitter_of: Indices
 ) -> None:
     """Fill in `Surroundings.seen`. order: of `_order`: rays that follow on each other take as long;  emitter_of: as
     `_choose` says"""
     grid, count = DiscGrid.of(discs.centers, discs.axes), len(order)
     # of areas that are no number, too: nothing
     distance: Float = dr.select(shapes.areas > 0, AWAY * dr.sqrt(shapes.areas), 0)
-    distance = dr.minimum(distance, FARTHEST * radius)
+    distance = dr.minimum(distance, FARTHEST * shapes.radius)
     towards, gaussians = upload_rows(directions.T), dr.opaque(ad.UInt32, count)
     turn, emitter = (upload(numbers, ad.UInt32) for numbers in (order, emitter_of))
     dr.eval(distance)
@@ -215,17 +302,17 @@ def _trace(
         dr.eval(seen)
 
 
-def _order(shapes: _Shapes, middle: Array, radius: float) -> Indices:
+def _order(shapes: _Shapes) -> Indices:
     """[N] the Gaussians by the axis along which their normals point most, then along a curve through all cells of a
-    cube about the model (Morton 1966): near ones are mostly near in it. middle: [3] of the model, metres, as is its
-    radius"""
+    cube about the model (Morton 1966): near ones are mostly near in it."""
     normal = shapes.normals
     x, y, z = dr.abs(normal)
     axis = dr.select((x >= y) & (x >= z), ad.UInt32(0), dr.select(y >= z, ad.UInt32(1), 2))
     side = 2 * axis + dr.select(dr.select(axis == 0, normal.x, dr.select(axis == 1, normal.y, normal.z)) < 0, 1, 0)
     curve = ad.UInt32(0)
-    for number, (column, place) in enumerate(zip(shapes.means, middle.tolist(), strict=True)):
-        cell = (column - place) * (CELLS / (4 * radius)) + CELLS / 2
+    step = MIDDLE_STEP * shapes.radius  # so that a Gaussian more does not move the curve
+    for number, (column, place) in enumerate(zip(shapes.means, shapes.middle, strict=True)):
+        cell = (column - round(place / step) * step) * (CELLS / (4 * shapes.radius)) + CELLS / 2
         spread = ad.UInt32(dr.select(cell > 0, dr.minimum(cell, CELLS - 1), 0))
         for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
             spread = (spread | spread << shift) & mask
@@ -235,15 +322,15 @@ def _order(shapes: _Shapes, middle: Array, radius: float) -> Indices:
     return np.sort(keys | np.arange(len(keys), dtype=np.uint64)) & np.uint64(0x7FFFFFFF)
 
 
-def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple[Indices, Indices]:
+def _choose(shapes: _Shapes, order: Indices, count: int) -> tuple[Indices, Indices]:
     """(emitters [count], which of them stands for each Gaussian [N]): one in the middle of each of `count` parts of
     equal area of the Gaussians in their `order`; all, once each, where they are no more. The nearest stands for a
     Gaussian, by place and normal."""
     total = len(order)
     if total <= count:
         return np.resize(np.arange(total, dtype=np.uint32), count), np.arange(total, dtype=np.uint32)
-    weight = dr.minimum(shapes.areas, (CHOSEN * radius) ** 2) * shapes.opacities
-    is_sound = dr.isfinite(dr.sum(shapes.means)) & (weight > 0)
+    weight = dr.minimum(shapes.areas, (CHOSEN * shapes.radius) ** 2) * shapes.opacities
+    is_sound = shapes.is_part & (weight > 0)
     weight, place = dr.select(is_sound, weight, 0), dr.select(is_sound, shapes.means, 0)
     normal = dr.select(dr.isfinite(shapes.normals), shapes.normals, 0)
     dr.eval(weight, place, normal)
@@ -252,7 +339,7 @@ def _choose(shapes: _Shapes, order: Indices, count: int, radius: float) -> tuple
         return np.zeros(count, np.uint32), np.zeros(total, np.uint32)
     middles = (np.arange(count) + 0.5) / count * ends[-1]
     emitters = order[np.searchsorted(ends, middles, side="right")].astype(np.uint32)
-    places = np.stack([*place.numpy(), *(NORMALS_APART * radius * normal.numpy())], axis=1, dtype=np.float64)
+    places = np.stack([*place.numpy(), *(NORMALS_APART * shapes.radius * normal.numpy())], axis=1, dtype=np.float64)
     _, nearest = cKDTree(places[emitters]).query(places, workers=-1)
     return emitters, nearest.astype(np.uint32)
 

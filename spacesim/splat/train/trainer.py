@@ -27,7 +27,7 @@ from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO, SPECULAR
 from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
-from spacesim.splat.light.surroundings import Surfaces, are_due
+from spacesim.splat.light.surroundings import RECOVERY, HeldSurroundings, are_due
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
@@ -134,8 +134,9 @@ class Trainer(TrainingLoop):
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
     def _look_around(self, light: LightModel) -> None:
-        """For light that bounces, where Gaussians have come or gone, and now and then."""
-        if light.config.bounce and (light.held_surfaces is None or are_due(self.iteration)):
+        """For light that bounces, now and then, but not while opacities that were reset stop no ray."""
+        is_due = are_due(self.iteration) and not self.config.refinement.recovers_at(self.iteration, RECOVERY)
+        if light.config.bounce and (light.held_surroundings is None or is_due):
             light.hold_surroundings(self.gaussians)
 
     def _turn_discs(self) -> None:
@@ -146,12 +147,13 @@ class Trainer(TrainingLoop):
 
     def _refine(self) -> None:
         """After a step: the strategy refines the set of Gaussians, or the warm start does while it lasts."""
-        x, opacities = self.gaussians.means.x, self.gaussians.logit_opacities
+        before = self.gaussians.logit_opacities
         self._refine_gaussians()
-        if self.gaussians.logit_opacities.index != opacities.index:
+        if self.gaussians.logit_opacities.index != before.index:
             self._view_pass.lists.after_refinement()
-        if self.light and self.gaussians.means.x.index != x.index:  # an opacity reset hides nothing
-            self.light.hold_surroundings(None)
+        source = self.optimizer.take_source()
+        if self.light and source is not None:
+            self.light.follow(source)
 
     def _refine_gaussians(self) -> None:
         warm, done = self.warm_start, self.iteration
@@ -265,7 +267,7 @@ class Trainer(TrainingLoop):
                 tensors |= {f"{name}.{order}.{i:02d}": moment for i, moment in enumerate(moments)}
         tensors |= self.pictures.tensors()
         tensors |= {f"strategy.{name}": np.array(value) for name, value in self.strategy.state.items()}
-        held = self.light.held_surfaces if self.light else None
+        held = self.light.held_surroundings if self.light else None
         if held is not None:
             tensors |= held.tensors()
         if self.warm_start and self._warming(self.iteration):
@@ -291,8 +293,9 @@ class Trainer(TrainingLoop):
         optimizer, light_optimizer = Adam(gaussians.rows()), NetworkAdam(_learned(light))
         _restore_moments(optimizer, tensors, "adam")
         _restore_moments(light_optimizer, tensors, "adam.light")
-        if light:
-            light.hold_surroundings(Surfaces.from_tensors(tensors, gaussians.count))
+        held = HeldSurroundings.from_tensors(tensors, gaussians.count)
+        if light and held:
+            light.hold_surroundings(held)
         self.pictures.restore(tensors)
         state = _restore_state(self.strategy.state, tensors, "strategy", gaussians.count)
         warming = self.warm_start is not None and self._warming(header.iteration)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from spacesim.backend import ad
+from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig
@@ -20,6 +21,7 @@ from spacesim.splat.light.surroundings import (
     MOST_RAYS,
     OPAQUE,
     SKY,
+    HeldSurroundings,
     Surfaces,
     Surroundings,
     are_due,
@@ -28,7 +30,6 @@ from spacesim.splat.light.surroundings import (
 )
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import preset, with_options
-from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 
 RADIUS = 2.0  #: of the models here
@@ -146,42 +147,77 @@ def test_what_takes_seconds_says_so_once(monkeypatch, caplog):
     with caplog.at_level("INFO"):
         for sun in np.eye(3):
             light.sunlight(splats, sun)
-    assert [record.message for record in caplog.records].count(
-        "light that bounces: 0 million rays are traced, once for all pictures"
-    ) == 1
+        for _ in range(2):
+            light.hold_surroundings(splats)
+            light.sunlight(splats, np.eye(3)[0])
+    start = "light that bounces: 0 million rays are traced, "
+    assert [record.message for record in caplog.records] == [
+        f"{start}once for all pictures",
+        f"{start}now and then in training",
+    ]
 
 
 def test_surfaces_of_a_checkpoint_are_checked():
     tensors = surfaces(5).tensors()
-    back = Surfaces.from_tensors(tensors, 5)
-    assert back is not None
-    for name, values in back.tensors().items():
-        np.testing.assert_array_equal(values, tensors[name])
-    assert Surfaces.from_tensors({"means": tensors["surfaces.means"]}, 5) is None
+    source = np.array([4.0, 4.0, 0.0])
+    held = HeldSurroundings.from_tensors({**tensors, "surfaces.source": source}, 3)
+    assert held is not None
+    for name, values in held.tensors().items():
+        np.testing.assert_array_equal(values, tensors.get(name, source))
+    assert HeldSurroundings.from_tensors({"means": tensors["surfaces.means"]}, 5) is None
     name = "surfaces.normals"
     with pytest.raises(ValueError, match=r"surfaces\.normals: expected \(5, 3\), found \(4, 3\)"):
-        Surfaces.from_tensors({**tensors, name: tensors[name][:4]}, 5)
+        HeldSurroundings.from_tensors({**tensors, name: tensors[name][:4]}, 5)
+    for bad in (
+        {},
+        {"surfaces.source": source[:2]},
+        {"surfaces.source": source + 1},
+        {"surfaces.source": source * np.nan},
+    ):
+        with pytest.raises(ValueError, match="expected 3 numbers of 5 Gaussians"):
+            HeldSurroundings.from_tensors({**tensors, **bad}, 3)
     with pytest.raises(KeyError, match=r"surfaces\.quaternions"):
-        Surfaces.from_tensors({name: values for name, values in tensors.items() if name != "surfaces.quaternions"}, 5)
+        HeldSurroundings.from_tensors({k: v for k, v in tensors.items() if k != "surfaces.quaternions"}, 5)
+
+
+def test_those_that_come_see_what_they_were_made_of_saw():
+    """Twice refined: halves of 7, 3 and 11 gone, with 11 an emitter."""
+    of, count = surfaces(40, size=0.4), 40
+    held = HeldSurroundings(of)
+    whole = held.surroundings(40, RADIUS, count)
+    first, second = np.r_[0:7, 8:40, 7, 7], np.delete(np.arange(41), [3, 10])
+    for source in (first, second):
+        held.follow(upload(source, ad.UInt32))
+    parents = first[second]
+    now = held.surroundings(40, RADIUS, len(parents))
+    np.testing.assert_array_equal(seen_along(now, len(parents)), seen_along(whole, count)[:, parents])
+    emitters = np.array(now.emitters)
+    expected = [10 if e == 11 else 2 if e == 3 else e for e in np.array(whole.emitters)]
+    np.testing.assert_array_equal(parents[emitters], expected)
+    assert emitters[7] == np.flatnonzero(parents == 7)[0]
+    alone = HeldSurroundings(of, upload(np.array([39], np.uint32), ad.UInt32)).surroundings(40, RADIUS, 1)
+    assert (np.array(alone.emitters) == 0).all()
 
 
 def test_what_is_held_is_of_as_many_gaussians():
     light, splats = lit_model(surfaces(20), 50)
-    light.hold_surroundings(surfaces(21))
+    light.hold_surroundings(HeldSurroundings(surfaces(21)))
     with pytest.raises(ValueError, match="held for 21 Gaussians, found 20"):
         light.surroundings(splats)
-    light.hold_surroundings(surfaces(20))
+    light.hold_surroundings(HeldSurroundings(surfaces(20)))
     assert light.surroundings(splats) is light.surroundings(splats)
 
 
-def test_an_opacity_reset_hides_no_surroundings(small_lit_dataset):
-    """All opacities fall below what stops rays; until they are back, what was seen before them is."""
-    config = with_options(preset("demo", "shadow-map"), iterations=40, init_count=200)
-    refinement = replace(config.refinement, refine_every=5, reset_every=2, refine_stop=30, pause_after_reset=10)
-    trainer = Trainer(small_lit_dataset, replace(config, refinement=replace(refinement, refine_start=5)))
+@pytest.mark.parametrize(("reset_every", "pause", "steps"), [(2, 10, 20), (2, 0, 20), (10, 10, 51)])
+def test_an_opacity_reset_hides_no_surroundings(small_lit_dataset, reset_every, pause, steps):
+    """All opacities fall below what stops rays; until they are back, what was seen before them is: after a reset alone,
+    one that prunes, one in whose step rays are due."""
+    config = with_options(preset("demo", "shadow-map"), iterations=80, init_count=200)
+    refinement = replace(config.refinement, refine_every=5, reset_every=reset_every, refine_stop=70, refine_start=5)
+    trainer = Trainer(small_lit_dataset, replace(config, refinement=replace(refinement, pause_after_reset=pause)))
     trainer.gaussians.logit_opacities = dr.opaque(ad.Float, 2.0, trainer.gaussians.count)
     assert trainer.light is not None
-    while trainer.iteration < 20:
+    while trainer.iteration < steps:
         trainer.step()
     opacities = 1 / (1 + np.exp(-trainer.gaussians.to_numpy()["logit_opacities"]))
     assert opacities.max() < OPAQUE, "reset"
@@ -190,14 +226,12 @@ def test_an_opacity_reset_hides_no_surroundings(small_lit_dataset):
     assert (seen_along(around, trainer.gaussians.count) != SKY).mean() > 0.05
 
 
-def test_no_look_around_falls_on_an_opacity_reset():
-    assert [step for step in range(1300) if are_due(step)] == [50, 100, 200, 700, 1200]
-    reset = DensificationConfig().reset_every * DensificationConfig().refine_every
-    assert not any(are_due(step) for times in range(1, 6) for step in range(times * reset, times * reset + 200))
+def test_rays_are_traced_often_at_first():
+    assert [step for step in range(2600) if are_due(step)] == [0, 50, *range(100, 1001, 100), 1500, 2000, 2500]
 
 
 def test_training_goes_on_to_the_bit_between_two_looks_around(small_lit_dataset, tmp_path):
-    """Rays are traced anew after 50 and 100 steps and where Gaussians come or go; checkpoints fall in between."""
+    """Rays are traced anew after 50 and 100 steps, Gaussians come and go; checkpoints fall in between."""
     config = with_options(preset("demo", "shadow-map"), iterations=130, init_count=200)
     config = replace(config, refinement=replace(config.refinement, refine_every=40, refine_start=30, refine_stop=110))
     straight, stops, counts = Trainer(small_lit_dataset, config), (45, 80, 97), set()

@@ -32,19 +32,28 @@ class Adam(AdamSteps):
     slices: the rows of each part; features, a packed row, are none
     layouts, arrays: how the moments of each part lie, and where
     features: their two moments [F * N], or none
+    source: which each Gaussian was at the last `take_source`, UInt32 [N]; None: all are what they were
     """
 
     def __init__(self, rows: list[Float]) -> None:
         self.slices, count = parts(len(rows)), dr.width(rows[0])
+        self.source: UInt32 | None = None
         self.arrays: list[list[Float]] = []
         self.layouts: list[tuple[PackedArray, ...]] = []
         self._lay_out(count)
         self.arrays = [zeros(layout) for layout in self.layouts]
         self.features = [dr.opaque(ad.Float, 0, dr.width(row)) for row in 2 * rows[self.slices[-1].stop :]]
 
+    def take_source(self) -> UInt32 | None:
+        """`source`, counted anew from now on."""
+        source, self.source = self.source, None
+        return source
+
     def select(self, index: UInt32, fresh: Bool) -> None:
         """Entry i of each moment becomes entry index[i], or zero where `fresh[i]`. index, fresh: [M]."""
         before, count, chosen = self.layouts, self.count, dr.width(index)
+        self.source = ad.UInt32(index) if self.source is None else dr.gather(ad.UInt32, self.source, index)
+        dr.eval(self.source)
         self._lay_out(chosen)
         for number, (old, new) in enumerate(zip(before, self.layouts, strict=True)):
             pairs = load(self.arrays[number], old, index)

@@ -65,6 +65,16 @@ class DensificationConfig:
         pausing = step % (self.reset_every * self.refine_every) < self.pause_after_reset
         return self.refine_start < step < self.refine_stop and step % self.refine_every == 0 and not pausing
 
+    def resets_at(self, step: int) -> bool:
+        """Whether opacities are lowered after so many steps: on the interval, where the pause is over in time."""
+        due = step % (self.reset_every * self.refine_every) == 0 and step + self.pause_after_reset <= self.refine_stop
+        return due and self.refine_start < step < self.refine_stop
+
+    def recovers_at(self, step: int, steps: int) -> bool:
+        """Whether opacities were lowered no more than so many steps ago."""
+        since = step % (self.reset_every * self.refine_every)
+        return since < steps and self.resets_at(step - since)
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianStatistics:
@@ -124,13 +134,12 @@ class DensityControl(Strategy):
     ) -> DensificationCounts:
         config = self.config
         done = DensificationCounts()
-        since_reset = step % (config.reset_every * config.refine_every)
         active = config.refine_start < step < config.refine_stop
         if config.refines_at(step):
             done = self._grow_and_prune(step, gaussians, optimizer, rng, leniency)
         elif active and step % config.refine_every == 0 and self._outside_is_due(step):
             done = self._prune_outside(step, gaussians, optimizer, rng)
-        if active and since_reset == 0 and step + config.pause_after_reset <= config.refine_stop:
+        if config.resets_at(step):
             limit_opacities(gaussians, optimizer, 2 * config.prune_opacity)
         return done
 
