@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
+from spacesim.backend.memory import check_free_memory
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.learning.reflectance import unit_normals
@@ -112,11 +113,7 @@ class Surroundings:
             emitters = emitters[left[np.maximum(np.searchsorted(left, np.arange(len(emitters)), side="right") - 1, 0)]]
         else:
             emitters[:] = 0
-        pairs, before, now = (
-            dr.width(self.seen) // count,
-            dr.opaque(ad.UInt32, count),
-            dr.opaque(ad.UInt32, len(sources)),
-        )
+        pairs, before, now = dr.width(self.seen) // count, *(dr.opaque(ad.UInt32, n) for n in (count, len(sources)))
         slot = dr.arange(ad.UInt32, pairs * len(sources))
         seen = dr.gather(ad.UInt32, self.seen, slot // now * before + dr.gather(ad.UInt32, source, slot % now))
         dr.eval(seen)
@@ -160,9 +157,8 @@ class HeldSurroundings:
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a checkpoint."""
-        return self.surfaces.tensors() | (
-            {} if self.source is None else {SOURCE: self.source.numpy().astype(np.float64)}
-        )
+        source = {} if self.source is None else {SOURCE: self.source.numpy().astype(np.float64)}
+        return self.surfaces.tensors() | source
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, np.ndarray], count: int) -> "HeldSurroundings | None":
@@ -189,15 +185,17 @@ def ray_count(emitters: int) -> int:
 
 
 def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surroundings:
-    """Trace the rays. emitters: how many;  radius: of the model, metres"""
-    directions = fibonacci_sphere(ray_count(emitters))
+    """Trace the rays. emitters: how many;  radius: of the model, metres. Raises MemoryError where what they meet does
+    not fit into memory."""
+    directions, count = fibonacci_sphere(ray_count(emitters)), len(surfaces.means)
     pairs = len(directions) // 2
+    check_free_memory(4 * pairs * count, f"light that bounces onto {count} Gaussians")
     rows = [upload(row) for row in directions.reshape(pairs, 6).T]
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
     shapes = _Shapes.of(surfaces, radius)
     order = _order(shapes)
     numbers, emitter_of = _choose(shapes, order, emitters)
-    seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * len(surfaces.means))
+    seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * count)
     discs = _Discs.of(shapes)
     if discs is not None:
         _trace(seen, shapes, discs, directions, order, emitter_of)
@@ -227,12 +225,16 @@ class _Shapes:
         means, log_scales, normals = (upload_rows(values.T) for values in rows)
         scales, opacity = dr.exp(log_scales), opacities(upload(surfaces.logit_opacities))
         x, y, z = scales
-        away = [dr.abs(column - place) for column, place in zip(means, middle, strict=True)]
+        is_part = ad.Bool(True)
+        for column, place in zip(
+            means, middle, strict=True
+        ):  # one by one: the larger of two may hide what is no number
+            is_part &= dr.abs(column - place) < FARTHEST_DISC * radius
         shapes = _Shapes(
             radius,
             middle,
             means,
-            dr.maximum(dr.maximum(away[0], away[1]), away[2]) < FARTHEST_DISC * radius,
+            is_part,
             scales,
             ad.Array4f([upload(row) for row in surfaces.quaternions.T]),
             dr.select(dr.isfinite(opacity), opacity, 0),
@@ -258,7 +260,8 @@ class _Discs:
         reach = dr.sqrt(2 * dr.log(dr.maximum(opacity, OPAQUE) / EDGE))
         length2 = dr.squared_norm(shapes.quaternions)
         keep = shapes.is_part & (opacity > OPAQUE) & (length2 > 0) & dr.isfinite(length2)
-        keep &= dr.max(scales) * reach < shapes.radius
+        for scale in scales:
+            keep &= scale * reach < shapes.radius
         numbers = cast(UInt32, dr.compress(keep))
         if not len(numbers):
             return None

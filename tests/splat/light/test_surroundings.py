@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from spacesim.backend import ad
+from spacesim.backend import ad, memory
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
 from spacesim.splat.light import model as light_module
@@ -100,6 +100,27 @@ def test_rays_meet_what_they_meet_in_float64():
     assert 0.2 < hits / found.size < 0.9
     assert np.mean(same) > 0.99
     assert np.mean(sides) > 0.999
+
+
+def test_what_is_no_number_stops_no_ray_and_changes_no_other():
+    of, count, broken = surfaces(150), 150, slice(3, 9)
+    arrays = {field.name: getattr(of, field.name).copy() for field in fields(Surfaces)}
+    hidden = replace(
+        of, logit_opacities=np.where((np.arange(count) >= 3) & (np.arange(count) < 9), -9, of.logit_opacities)
+    )
+    arrays["means"][3, 0], arrays["means"][4, 2], arrays["log_scales"][5, 1] = np.nan, np.inf, np.nan
+    arrays["log_scales"][6, 0], arrays["quaternions"][7, 0], arrays["logit_opacities"][8] = 1e30, np.nan, np.nan
+    sound, odd = (look_around(one, 200, RADIUS) for one in (hidden, Surfaces(**arrays)))
+    expected, found = (np.delete(seen_along(one, count), np.arange(count)[broken], axis=1) for one in (sound, odd))
+    assert (expected != SKY).mean() > 0.2
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_too_many_rays_for_the_memory_are_refused(monkeypatch):
+    monkeypatch.setattr(memory, "LARGE", 0)
+    monkeypatch.setattr(memory, "free_memory", lambda needed=0: 2 * LEAST_RAYS * 5 - 1)
+    with pytest.raises(MemoryError, match="light that bounces onto 5 Gaussians needs about"):
+        look_around(surfaces(5), 10, RADIUS)
 
 
 def test_few_emitters_stand_for_what_is_near():
