@@ -12,7 +12,7 @@ from spacesim.data.files import JsonMapping, JsonValue, write_bytes
 
 POINTS, TRIANGLES = 0, 4  #: modes of a primitive
 _MAX_BYTES = 0xFFFFFFFF  # what the header can hold
-_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125}
 _VERTICES, _INDICES = 34962, 34963  # targets of a buffer view
 

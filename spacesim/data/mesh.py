@@ -1,5 +1,6 @@
 """Meshes as vertices and faces, and the signed distance to one, also where it is not watertight."""
 
+import base64
 import io
 import re
 import struct
@@ -14,7 +15,9 @@ from spacesim.data.files import JsonValue, read_bytes, write_bytes
 from spacesim.data.geometry import Array
 from spacesim.data.glb import TRIANGLES, write_glb
 from spacesim.data.images.color import linear_from_srgb
+from spacesim.data.images.png import png_bytes
 
+LEVELS = 256  #: of roughness and of metallic that a glTF texture tells apart; what is between them is read between
 READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 WRITTEN = (".ply", ".obj", ".glb", ".stl")
 MAX_COORDINATE = 1e9  #: metres; corners beyond it are taken for damage (the Moon is at 3.8e8)
@@ -234,34 +237,37 @@ def write_mesh(
 def _write_glb_mesh(
     path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None, surface: VertexSurface | None
 ) -> None:
-    """glTF has no roughness a vertex: `_ROUGHNESS` and `_METALLIC` are attributes of ours. Metals and what is none have
-    a material each with the median roughness. Roughness is the square root of alpha, as in glTF (3.9.2, B.3)."""
+    """Colours are COLOR_0. glTF has no roughness a vertex, but textures: one of all pairs of roughness and metallic, in
+    which a vertex's place says its own. Roughness is the square root of alpha, as in glTF (3.9.2, B.3)."""
     attributes = {"POSITION": vertices.astype(np.float32)}
     document: dict[str, JsonValue] = {}
-    groups, materials = [faces], [_gltf_material()]
     if colors is not None:
         opaque = np.ones((len(colors), 1))
         linear = linear_from_srgb(np.clip(colors, 0, 1))
         attributes["COLOR_0"] = np.concatenate([linear, opaque], axis=1).astype(np.float32)
+    material: dict[str, JsonValue] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
     if surface is not None:
-        roughness = np.sqrt(surface.roughness).astype(np.float32)
-        attributes |= {"_ROUGHNESS": roughness, "_METALLIC": surface.metallic.astype(np.float32)}
-        is_metal = surface.metallic[faces].mean(axis=1) >= 0.5
-        parts = [(faces[is_metal == metal], float(metal)) for metal in (False, True) if (is_metal == metal).any()]
-        groups = [part for part, _ in parts]
-        materials = [_gltf_material(metallic, float(np.median(roughness[part]))) for part, metallic in parts]
+        pair = np.stack([np.sqrt(surface.roughness), surface.metallic], axis=1)
+        attributes["TEXCOORD_0"] = ((0.5 + (LEVELS - 1) * np.clip(pair, 0, 1)) / LEVELS).astype(np.float32)
+        material["pbrMetallicRoughness"] = {"metallicRoughnessTexture": {"index": 0}}
+        document = _texture_of_surfaces()
     elif colors is not None:
-        materials[0]["extensions"] = {"KHR_materials_unlit": {}}
+        material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
-    primitives = [(part.ravel().astype(np.uint32), {"material": number}) for number, part in enumerate(groups)]
-    write_glb(path, attributes, TRIANGLES, primitives, {"materials": list(materials), **document})
+    primitive = faces.ravel().astype(np.uint32), {"material": 0}
+    write_glb(path, attributes, TRIANGLES, [primitive], {"materials": [material], **document})
 
 
-def _gltf_material(metallic: float = 0.0, roughness: float | None = None) -> dict[str, JsonValue]:
-    surface: dict[str, JsonValue] = {"metallicFactor": metallic}
-    if roughness is not None:
-        surface["roughnessFactor"] = round(roughness, 4)
-    return {"doubleSided": True, "pbrMetallicRoughness": surface}
+def _texture_of_surfaces() -> dict[str, JsonValue]:
+    """What a glTF document says of a texture whose roughness, green, grows along u and whose metallic, blue, along v:
+    read between pixels, without smaller copies, which would mix what is far apart."""
+    level = np.arange(LEVELS, dtype=np.uint8)
+    pixels = np.zeros((LEVELS, LEVELS, 3), np.uint8)
+    pixels[..., 1], pixels[..., 2] = level, level[:, None]
+    uri = "data:image/png;base64," + base64.b64encode(png_bytes(pixels)).decode()
+    linear, edge = 9729, 33071
+    sampler: JsonValue = {"magFilter": linear, "minFilter": linear, "wrapS": edge, "wrapT": edge}
+    return {"images": [{"uri": uri}], "samplers": [sampler], "textures": [{"sampler": 0, "source": 0}]}
 
 
 class SignedDistance:

@@ -42,7 +42,7 @@ def glb_array(document: dict, body: bytes, index: int) -> np.ndarray:
     view = document["bufferViews"][accessor["bufferView"]]
     assert view["byteOffset"] % 4 == 0
     assert view["byteOffset"] + view["byteLength"] <= len(body)
-    columns = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
     kind = np.dtype({5125: "<u4", 5126: "<f4"}[accessor["componentType"]])
     array = np.frombuffer(body, kind, accessor["count"] * columns, view["byteOffset"])
     assert view["byteLength"] == array.nbytes

@@ -1,14 +1,19 @@
 """Colours of vertices, against surfaces whose colours are known at every point; files of them, by trimesh."""
 
+import base64
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
+from scipy.ndimage import map_coordinates
 from splat_readers import glb_array, glb_chunks
 from splats import light_of, srgb_of
 from test_tsdf import cameras, rays
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
+from spacesim.data.images.png import read_png
 from spacesim.data.mesh import VertexSurface, write_mesh
 from spacesim.data.records import Camera
 from spacesim.learning.prediction import MaterialView, Prediction
@@ -105,32 +110,41 @@ def test_colors_in_files(tmp_path, suffix):
 
 
 def test_materials_in_gltf_are_lit(tmp_path):
-    """Base colours, roughness and metal a vertex, and a material of metals and one of others: roots of alpha."""
+    """Base colours a vertex; roughness, a root of alpha, and metallic by their place in a texture."""
     mesh = trimesh.creation.icosphere(2)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    colors, roughness = paint(vertices), np.linspace(0.04, 0.49, len(vertices))
-    metallic = (vertices[:, 2] > 0).astype(float)
-    write_mesh(tmp_path / "a.glb", vertices, faces, colors, surface=VertexSurface(roughness, metallic))
+    colors, alpha = paint(vertices), np.linspace(0, 1, len(vertices))
+    metallic = np.random.default_rng(0).uniform(size=len(vertices)).round(1)
+    write_mesh(tmp_path / "a.glb", vertices, faces, colors, surface=VertexSurface(alpha, metallic))
     document, body = glb_chunks(tmp_path / "a.glb")
     assert "extensionsUsed" not in document
-    assert not any("extensions" in material for material in document["materials"])
-    seen = []
-    for metal, primitive in enumerate(document["meshes"][0]["primitives"]):
-        attributes = {name: glb_array(document, body, index) for name, index in primitive["attributes"].items()}
-        np.testing.assert_allclose(attributes["COLOR_0"][:, :3], light_of(colors), atol=1e-6)
-        np.testing.assert_allclose(attributes["_ROUGHNESS"].ravel(), np.sqrt(roughness), atol=1e-6)
-        assert np.array_equal(attributes["_METALLIC"].ravel(), metallic)
-        part = glb_array(document, body, primitive["indices"]).reshape(-1, 3)
-        assert ((metallic[part].mean(axis=1) > 0.5) == metal).all()
-        middle = pytest.approx(np.median(np.sqrt(roughness[part])), abs=1e-4)
-        surface = document["materials"][primitive["material"]]["pbrMetallicRoughness"]
-        assert surface == {"metallicFactor": metal, "roughnessFactor": middle}
-        seen.append(part)
-    assert sorted(np.concatenate(seen).tolist()) == sorted(faces.tolist())
-    write_mesh(tmp_path / "b.glb", vertices, faces, colors, surface=VertexSurface(roughness, 1 - 0 * metallic))
-    document, _ = glb_chunks(tmp_path / "b.glb")
-    (primitive,), (material,) = document["meshes"][0]["primitives"], document["materials"]
-    assert (primitive["material"], material["pbrMetallicRoughness"]["metallicFactor"]) == (0, 1)
+    assert document["materials"] == [
+        {"doubleSided": True, "pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}}
+    ]
+    (primitive,) = document["meshes"][0]["primitives"]
+    attributes = {name: glb_array(document, body, index) for name, index in primitive["attributes"].items()}
+    np.testing.assert_allclose(attributes["COLOR_0"][:, :3], light_of(colors), atol=1e-6)
+    assert np.array_equal(glb_array(document, body, primitive["indices"]).reshape(-1, 3), faces)
+    head, _, content = document["images"][0]["uri"].partition(",")
+    assert head == "data:image/png;base64"
+    texture = read_png(Path("texture"), base64.b64decode(content)) / 255
+    places = attributes["TEXCOORD_0"].T[::-1] * 256 - 0.5  # rows from above, along v
+    roughness, metal = (map_coordinates(texture[..., k], places, order=1, mode="nearest") for k in (1, 2))
+    np.testing.assert_allclose(roughness, np.sqrt(alpha), atol=1e-4)
+    np.testing.assert_allclose(metal, metallic, atol=1e-4)
+
+
+def test_trimesh_finds_a_vertex_in_the_texture_of_materials(tmp_path):
+    mesh = trimesh.creation.icosphere(2)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    surface = VertexSurface(np.full(len(vertices), 0.25), np.ones(len(vertices)))
+    write_mesh(tmp_path / "a.glb", vertices, faces, np.full((len(vertices), 3), 0.5), surface=surface)
+    shapes = trimesh.load(tmp_path / "a.glb", process=False).geometry
+    (found,) = shapes.values()
+    picture = np.array(found.visual.material.metallicRoughnessTexture)
+    assert picture.shape == (256, 256, 3)
+    column, row = np.rint(found.visual.uv[0] * [256, 256] - 0.5).astype(int)
+    assert picture[255 - row, column].tolist() == [0, 128, 255]  # trimesh turns v about
 
 
 def test_a_picture_of_materials_has_five_channels():
