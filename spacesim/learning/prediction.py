@@ -15,12 +15,7 @@ more until it is written."""
 
 
 KINDS = ("rgb", "alpha", "depth", "normal", "shadow")  #: of pictures of a prediction
-MATERIAL_KINDS = (
-    "albedo",
-    "specular",
-    "roughness",
-    "metallic",
-)  #: of a `MaterialView`, which no Sun changes
+MATERIAL_KINDS = ("albedo", "specular", "roughness", "metallic")  #: of a `MaterialView`, which no Sun changes
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,8 +72,14 @@ def draw_material(
     assert output.features is not None
     straight = [over_alpha(plane, output.alpha) for plane in output.features[:8]]
     shown = planes_image([*straight, *unit(ad.Array3f(output.features[8:]))], camera.width, camera.height)
-    roughness, metallic, alpha = shown[..., 6], shown[..., 7], output.image("alpha")
-    return MaterialView(shown[..., :3], roughness, metallic, shown[..., 8:], alpha, shown[..., 3:6])
+    return MaterialView(
+        albedo=shown[..., :3],
+        specular=shown[..., 3:6],
+        roughness=shown[..., 6],
+        metallic=shown[..., 7],
+        normal=shown[..., 8:],
+        alpha=output.image("alpha"),
+    )
 
 
 def no_material(path: Path, found: str) -> InputError:

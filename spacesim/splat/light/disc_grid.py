@@ -58,13 +58,10 @@ class DiscGrid:
             cell *= 2
         columns = [int(count) for count in np.floor((end - corner) / cell) + 2]
         discs, starts = _lists(boxes, entries, columns, normals, dr.dot(normals, (centers - corner_of) / cell_of))
-        scaled, index = (
-            [axis / square for axis, square in zip(axes, squares, strict=True)],
-            dr.arange(ad.UInt32, len(longer)),
-        )
+        count, scaled = len(longer), [axis / square for axis, square in zip(axes, squares, strict=True)]
         numbers = [value for vector in (centers, normals, *scaled) for value in vector]
-        records = [store(values, index, len(longer)) for values in packets(numbers)]
-        grid = DiscGrid(len(longer), records, discs, starts, corner_of, cell_of, _opaque(columns))
+        records = [store(values, dr.arange(ad.UInt32, count), count) for values in packets(numbers)]
+        grid = DiscGrid(count, records, discs, starts, corner_of, cell_of, _opaque(columns))
         dr.eval(grid)
         return grid
 

@@ -46,7 +46,6 @@ SOURCE = "surfaces.source"  #: in checkpoints
 GONE = 0xFFFFFFFF  #: in place of a Gaussian's number
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
 
-
 Indices = NDArray[np.signedinteger] | NDArray[np.unsignedinteger]
 
 
@@ -106,13 +105,14 @@ class Surroundings:
         does so from the place of the emitter before it, which is mostly near."""
         sources = source.numpy()
         first = np.full(count, GONE, np.uint32)
-        first[sources[::-1]] = np.arange(len(sources), dtype=np.uint32)[::-1]
+        first[sources[::-1]] = np.arange(len(sources), dtype=np.uint32)[::-1]  # the first of several is written last
         emitters = first[self.emitters.numpy()]
-        left = np.flatnonzero(emitters != GONE)
-        if len(left):
-            emitters = emitters[left[np.maximum(np.searchsorted(left, np.arange(len(emitters)), side="right") - 1, 0)]]
-        else:
+        is_gone = emitters == GONE
+        if is_gone.all():
             emitters[:] = 0
+        else:
+            numbers = np.where(is_gone, np.argmin(is_gone), np.arange(len(emitters)))
+            emitters = emitters[np.maximum.accumulate(numbers)]
         pairs, before, now = dr.width(self.seen) // count, *(dr.opaque(ad.UInt32, n) for n in (count, len(sources)))
         slot = dr.arange(ad.UInt32, pairs * len(sources))
         seen = dr.gather(ad.UInt32, self.seen, slot // now * before + dr.gather(ad.UInt32, source, slot % now))
@@ -226,9 +226,8 @@ class _Shapes:
         scales, opacity = dr.exp(log_scales), opacities(upload(surfaces.logit_opacities))
         x, y, z = scales
         is_part = ad.Bool(True)
-        for column, place in zip(
-            means, middle, strict=True
-        ):  # one by one: the larger of two may hide what is no number
+        # axis by axis: the larger of two numbers may hide what is none
+        for column, place in zip(means, middle, strict=True):
             is_part &= dr.abs(column - place) < FARTHEST_DISC * radius
         shapes = _Shapes(
             radius,
@@ -321,6 +320,7 @@ def _order(shapes: _Shapes) -> Indices:
             spread = (spread | spread << shift) & mask
         curve |= spread << number
     dr.eval(side, curve)
+    # 3 bits of the side, 30 of the place on the curve, 31 of the number: no two keys are equal
     keys = side.numpy().astype(np.uint64) << np.uint64(61) | curve.numpy().astype(np.uint64) << np.uint64(31)
     return np.sort(keys | np.arange(len(keys), dtype=np.uint64)) & np.uint64(0x7FFFFFFF)
 

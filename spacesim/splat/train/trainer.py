@@ -135,8 +135,10 @@ class Trainer(TrainingLoop):
 
     def _look_around(self, light: LightModel) -> None:
         """For light that bounces, now and then, but not while opacities that were reset stop no ray."""
-        is_due = are_due(self.iteration) and not self.config.refinement.recovers_at(self.iteration, RECOVERY)
-        if light.config.bounce and (light.held_surroundings is None or is_due):
+        step, refinement = self.iteration, self.config.refinement
+        if not light.config.bounce:
+            return
+        if light.held_surroundings is None or (are_due(step) and not refinement.recovers_at(step, RECOVERY)):
             light.hold_surroundings(self.gaussians)
 
     def _turn_discs(self) -> None:

@@ -62,18 +62,26 @@ class DensificationConfig:
     def refines_at(self, step: int) -> bool:
         """Whether Gaussians grow and are pruned after so many steps: on the interval, and not in the pause that begins
         with the training and with every opacity reset (as in gsplat)."""
-        pausing = step % (self.reset_every * self.refine_every) < self.pause_after_reset
-        return self.refine_start < step < self.refine_stop and step % self.refine_every == 0 and not pausing
+        pausing = self._since_reset(step) < self.pause_after_reset
+        return self.is_active(step) and step % self.refine_every == 0 and not pausing
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are lowered after so many steps: on the interval, where the pause is over in time."""
-        due = step % (self.reset_every * self.refine_every) == 0 and step + self.pause_after_reset <= self.refine_stop
-        return due and self.refine_start < step < self.refine_stop
+        in_time = step + self.pause_after_reset <= self.refine_stop
+        return self.is_active(step) and self._since_reset(step) == 0 and in_time
 
     def recovers_at(self, step: int, steps: int) -> bool:
         """Whether opacities were lowered no more than so many steps ago."""
-        since = step % (self.reset_every * self.refine_every)
+        since = self._since_reset(step)
         return since < steps and self.resets_at(step - since)
+
+    def is_active(self, step: int) -> bool:
+        """Whether the set of Gaussians may change after so many steps."""
+        return self.refine_start < step < self.refine_stop
+
+    def _since_reset(self, step: int) -> int:
+        """Steps since opacities would have been lowered, or since the training began."""
+        return step % (self.reset_every * self.refine_every)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +142,9 @@ class DensityControl(Strategy):
     ) -> DensificationCounts:
         config = self.config
         done = DensificationCounts()
-        active = config.refine_start < step < config.refine_stop
         if config.refines_at(step):
             done = self._grow_and_prune(step, gaussians, optimizer, rng, leniency)
-        elif active and step % config.refine_every == 0 and self._outside_is_due(step):
+        elif config.is_active(step) and step % config.refine_every == 0 and self._outside_is_due(step):
             done = self._prune_outside(step, gaussians, optimizer, rng)
         if config.resets_at(step):
             limit_opacities(gaussians, optimizer, 2 * config.prune_opacity)

@@ -90,7 +90,7 @@ class McmcStrategy(Strategy):
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
     ) -> DensificationCounts:
         schedule = self.schedule
-        if not (schedule.refine_start < step < schedule.refine_stop and step % schedule.refine_every == 0):
+        if not (schedule.is_active(step) and step % schedule.refine_every == 0):
             return DensificationCounts()
         opacity = 1 / (1 + np.exp(-np.array(gaussians.logit_opacities, np.float64)))
         dead = opacity <= leniency * self.mcmc.min_opacity
