@@ -171,10 +171,8 @@ class WarmStart:
     ) -> list[Float]:
         """Gradients of the projected foreground loss by the means, as it counts at `step`: 3 Floats [N]. Counts who is
         in the picture while densification waits. rows: of the Gaussians, the first 3 count"""
-        numbers = ad.Float([self.config.strength(step) * self.config.projection_weight])
-        gradients, framed = _pull(
-            rows[:3], camera, attraction.image, attraction.size, self.config.downsampling, numbers
-        )
+        weight = dr.opaque(ad.Float, self.config.strength(step) * self.config.projection_weight)
+        gradients, framed = _pull(rows[:3], camera, attraction.image, attraction.size, self.config.downsampling, weight)
         if self.active(step):
             self.state["framed"] = self.state["framed"] + framed
             dr.eval(self.state)
@@ -249,13 +247,14 @@ def bilinear(image: Float, size: tuple[int, int], u: Float, v: Float) -> Float:
 
 @recorded
 def _pull(
-    rows: list[Float], camera: Pinhole, image: Float, size: tuple[int, int], step: int, numbers: Float
+    rows: list[Float], camera: Pinhole, image: Float, size: tuple[int, int], step: int, weight: Float
 ) -> tuple[list[Float], Float]:
-    """(gradients by the 3 rows, Float [N]: 1 where the centre is in the picture). numbers: Float [1], the weight"""
+    """(gradients by the 3 rows, Float [N]: 1 where the centre is in the picture). weight: Float [1], no literal, as a
+    0 known beforehand has no gradients"""
     rows = [ad.Float(row) for row in rows]
     dr.enable_grad(rows)
     loss, framed = projected_loss(ad.Array3f(rows), camera, image, size, step)
-    dr.backward(loss * dr.gather(ad.Float, numbers, ad.UInt32(0)))
+    dr.backward(loss * dr.gather(ad.Float, weight, ad.UInt32(0)))
     return [dr.grad(row) for row in rows], dr.select(framed, ad.Float(1), 0)
 
 
