@@ -17,7 +17,7 @@ from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import shortest_axis
 
-TURNED = 0.2  #: a surface with n . s of at most -TURNED is turned away from the Sun (docs/research/shadows.md)
+TURNED = 0.15  #: a surface with n . s of at most -TURNED is turned away from the Sun
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.surface import unit
 
 EVERY = 100  #: steps between two turns
-LAST = 2_500  #: step of the last one: later turns cost 0.5 dB under known Suns in 20,000 steps
-SHARE = 0.1  #: of the way between both that each turns (docs/research/geometry.md)
+BOTH_UNTIL = 2_500  #: step of the last turn of normals: later ones cost 0.3 to 0.5 dB under known Suns
+SHARE = 0.1  #: of the way to the other that each turns (docs/research/geometry.md)
 
 
-def turn_discs(gaussians: Gaussians, first: int) -> None:
-    """Turn each disc (`flattened`) and its learned normal, three rows of the features from `first` on, of any length
-    and either sign, by `SHARE` of the way towards each other; a normal of no length turns nothing.
+def turn_discs(gaussians: Gaussians, first: int, both: bool = True) -> None:
+    """Turn each disc (`flattened`) by `SHARE` of the way towards its learned normal, three rows of the features from
+    `first` on, of any length and either sign, and with `both` that towards the disc; a normal of no length turns
+    nothing.
 
     A picture says little of how a disc of a pixel or two stands, its shading under many Suns little of where light is
     small or shadow errs: each knows what the other does not. Gradients know nothing of it: a step of training is
@@ -30,11 +31,15 @@ def turn_discs(gaussians: Gaussians, first: int) -> None:
     w, u = gaussians.quaternions[0], ad.Array3f(*list(gaussians.quaternions)[1:])
     turned = ad.Array4f(s * w - dr.dot(v, u), *(s * u + w * v + dr.cross(v, u)))
     turned *= dr.rsqrt(dr.square(s) + dr.squared_norm(v))
+    dr.eval(turned)
+    gaussians.quaternions = turned
+    if not both:
+        return
     moved = length * dr.normalize((1 - SHARE) * normal + SHARE * axis)
-    dr.eval(turned, moved)
+    dr.eval(moved)
     place = dr.arange(ad.UInt32, dr.width(gaussians.features))
     row, features = place // count, gaussians.features
     for i, values in enumerate(moved):
         features = dr.select(row == first + i, dr.gather(ad.Float, values, place % count), features)
     dr.eval(features)
-    gaussians.quaternions, gaussians.features = turned, features
+    gaussians.features = features
