@@ -259,7 +259,7 @@ def twin(
     faces = 1
     if field.surface:
         learned, of_shape = (cosines(n, direction)[:, 0] for n in (normal, shortest_axes(arrays)))
-        faces = np.interp(np.maximum(learned, of_shape), [-0.2, 0], [0, 1])
+        faces = np.interp(np.maximum(learned, of_shape), [-0.15, 0], [0, 1])
     color = paint(np.arange(len(direction)), direction)
     if not raw:
         visible = np.ones(len(color))
