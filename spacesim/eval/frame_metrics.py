@@ -101,9 +101,8 @@ def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> Fra
 
 
 def own_exposure(run: "Predictor", frame: Frame) -> float | None:
-    """EV of a frame that has its own, where a run knows light as bright as that shows it; else None."""
-    curve = run.gaussian_run.curve if run.gaussian_run else None
-    if frame.exposure is None or curve is None or not curve.reaches_beyond_white:
+    """EV of a frame that has its own, where a run knows light; else None."""
+    if frame.exposure is None or run.gaussian_run is None or run.gaussian_run.curve is None:
         return None
     return exposure_value(frame.exposure)
 

@@ -79,7 +79,7 @@ def test_a_picture_of_its_own_exposure_is_compared_with_it(make_run, bright, tmp
     assert found == pytest.approx(decibels(seen, 4 * truth, silhouette), abs=1e-4)
 
 
-def test_runs_of_radiance_are_exposed_as_the_picture_was(make_run, dataset):
+def test_runs_of_light_are_exposed_as_the_picture_was(make_run, dataset):
     class Model:
         curve = Curve("srgb", 0.0, 16.0)
 
@@ -87,9 +87,10 @@ def test_runs_of_radiance_are_exposed_as_the_picture_was(make_run, dataset):
     run.gaussian_run = Model()
     assert own_exposure(run, frame) == pytest.approx(3)
     assert own_exposure(run, dataset.test[0]) is None
-    for curve in (None, Curve("srgb", 0.0, 1.0)):
-        run.gaussian_run.curve = curve
-        assert own_exposure(run, frame) is None
+    run.gaussian_run.curve = Curve("srgb", 0.0, 1.0)
+    assert own_exposure(run, frame) == pytest.approx(3)
+    run.gaussian_run.curve = None
+    assert own_exposure(run, frame) is None
 
 
 def test_without_radiance_or_exposure_it_is_null_and_said_once(make_run, dataset, tmp_path):

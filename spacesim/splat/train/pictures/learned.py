@@ -14,7 +14,7 @@ from spacesim.splat.light.model import LightModel
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.pictures.exposure import Exposures
+from spacesim.splat.train.pictures.exposure import Exposures, known_gains
 from spacesim.splat.train.pictures.poses import PoseRefinement
 from spacesim.splat.train.pictures.suns import FirstSuns, SunEstimation
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss
@@ -22,7 +22,8 @@ from spacesim.splat.train.views import TrainingView, TrainingViews
 
 
 class LearnedPictures:
-    """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them"""
+    """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them, and
+    pictures do not name exposures of their own"""
 
     def __init__(
         self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
@@ -45,7 +46,10 @@ class LearnedPictures:
             )
             if poses is not None:
                 self.poses.stay(poses)
-        self.exposures = Exposures(len(dataset.train), rates.gains, steps) if config.exposure_per_picture else None
+        gains = known_gains(dataset, config.light)
+        self.exposures: Exposures | None = None
+        if config.exposure_per_picture or (gains != 1).any():
+            self.exposures = Exposures(gains, rates.gains, steps, config.exposure_per_picture)
         self.suns, self._antialiased = None, config.antialiased
         if config.sun == "unknown":
             assert first_suns is not None, "Suns that are unknown start somewhere"
@@ -146,7 +150,7 @@ class LearnedPictures:
         if self.poses:
             degrees, share = np.median(self.poses.moves(), axis=0).tolist()
             summary["poses"] = {"degrees": degrees, "share_of_distance": share}
-        if self.exposures:
+        if self.exposures and self.exposures.learned:
             gains = self.exposures.all_gains().mean(axis=1)
             summary["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
         if self.suns:
@@ -167,5 +171,6 @@ class LearnedPictures:
         return sentences
 
     def _learned(self) -> dict[str, PoseRefinement | Exposures | SunEstimation]:
-        every = {"pictures.poses": self.poses, "pictures.exposures": self.exposures, "pictures.suns": self.suns}
+        exposures = self.exposures if self.exposures and self.exposures.learned else None
+        every = {"pictures.poses": self.poses, "pictures.exposures": exposures, "pictures.suns": self.suns}
         return {name: learned for name, learned in every.items() if learned is not None}

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, srgb_from_linear
+from spacesim.data.images.tone import STANDARD_EXPOSURE
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.config import TrainConfig, preset, with_settings
+from spacesim.splat.train.pictures.exposure import known_gains
 from spacesim.splat.train.trainer import Trainer
 
 RANGES = 0.7, 0.35  #: of the logarithms of gains: of one picture a view, of several
@@ -31,12 +34,24 @@ def again(small_dataset, tmp_path_factory) -> tuple[Dataset, np.ndarray]:
     return with_gains(small_dataset, tmp_path_factory.mktemp("again"), 3, 3)
 
 
-def with_gains(dataset: Dataset, root: Path, views: int, times: int) -> tuple[Dataset, np.ndarray]:
-    """(dataset, gains [V, 3]): pictures 0.45 as bright, so that hardly any clips, under random gains in light, whose
-    mean logarithm is 0 over all pictures, and over those of a view where there are several."""
+@pytest.fixture(scope="module")
+def named(small_dataset, tmp_path_factory) -> tuple[Dataset, np.ndarray]:
+    """Its pictures under known exposures, which they name."""
+    root = tmp_path_factory.mktemp("named")
+    dataset, gains = with_gains(small_dataset, root, len(small_dataset.train), 1, channels=1)
+    base = 0.45 * STANDARD_EXPOSURE
+    frames = zip(dataset.train, gains[:, 0], strict=True)
+    train = tuple(replace(frame, exposure=float(base * gain)) for frame, gain in frames)
+    scene = {"config": {"camera": {"tone": "srgb"}}, "exposure": base}
+    return replace(dataset, train=train, scene=scene), gains[:, 0]
+
+
+def with_gains(dataset: Dataset, root: Path, views: int, times: int, channels: int = 3) -> tuple[Dataset, np.ndarray]:
+    """(dataset, gains [V, channels]): pictures 0.45 as bright, so that hardly any clips, under random gains in light,
+    whose mean logarithm is 0 over all pictures, and over those of a view where there are several."""
     (root / "images").mkdir()
     values = json.loads((dataset.root / "transforms.json").read_text())
-    logs = np.random.default_rng(0).uniform(-1, 1, (views, times, 3))
+    logs = np.random.default_rng(0).uniform(-1, 1, (views, times, channels))
     logs *= RANGES[times > 1]
     logs -= logs.mean(axis=1 if times > 1 else 0, keepdims=True)
     poses = {frame["file_path"]: frame["transform_matrix"] for frame in values["frames"]}
@@ -57,7 +72,7 @@ def with_gains(dataset: Dataset, root: Path, views: int, times: int) -> tuple[Da
     values["test_filenames"] = [frame["file_path"] for frame in frames[views * times :]]
     (root / "points.ply").write_bytes((dataset.root / "points.ply").read_bytes())
     (root / "transforms.json").write_text(json.dumps({**values, "frames": frames}))
-    return read_dataset(root), np.exp(logs.reshape(-1, 3))
+    return read_dataset(root), np.exp(logs.reshape(-1, channels))
 
 
 def trained(dataset: Dataset, config: TrainConfig) -> Trainer:
@@ -115,3 +130,34 @@ def test_the_gradient_by_gains_is_that_of_the_loss(exposed):
             ends.append(float(loss().value[0]))
         exposures.numbers.values[0, channel] += 0.01
         assert gradient[channel] == pytest.approx((ends[0] - ends[1]) / 0.02, rel=0.05)
+
+
+def test_exposures_that_pictures_name_are_their_gains(named):
+    """Of light as they are, of sRGB values by their curve's power, none of radiance or where the scene says none."""
+    dataset, gains = named
+    light = with_settings(
+        preset("demo", "relight"), {"light.linear": True, "light.exposure": float(np.log2(0.45))}
+    ).light
+    np.testing.assert_allclose(known_gains(dataset, light), gains, rtol=1e-12)
+    np.testing.assert_allclose(known_gains(dataset, replace(light, exposure=0.0)), 0.45 * gains, rtol=1e-12)
+    np.testing.assert_allclose(known_gains(dataset, None), gains ** (1 / 2.4), rtol=1e-12)
+    assert (known_gains(dataset, replace(light, radiance=True)) == 1).all()
+    assert (known_gains(replace(dataset, scene={}), light) == 1).all()
+    broken = replace(dataset, train=(replace(dataset.train[0], exposure=1e300), *dataset.train[1:]))
+    with pytest.raises(InputError, match="expected an exposure within 40 EV of the scene's, found 1e"):
+        known_gains(broken, light)
+
+
+def test_pictures_of_named_exposures_train_a_nearer_model(named):
+    """And no gain is learned; where gains are, they start there, and keep their mean."""
+    dataset, gains = named
+    config = replace(preset("demo"), sh_degree=0)
+    nameless = replace(dataset, train=tuple(replace(frame, exposure=None) for frame in dataset.train))
+    without, trainer = trained(nameless, config), trained(dataset, config)
+    assert without.pictures.exposures is None
+    np.testing.assert_allclose(trainer.pictures.exposures.all_gains(), gains[:, None] ** (1 / 2.4) * np.ones(3))
+    assert trainer.pictures.cameras() is None
+    assert psnr_of_tests(trainer, dataset) > psnr_of_tests(without, dataset) + 0.5
+    learned = trained(dataset, replace(config, exposure_per_picture=True)).pictures.exposures.all_gains()
+    np.testing.assert_allclose(np.log(learned).mean(axis=0), np.log(gains).mean() / 2.4, atol=1e-9)
+    assert (learned != trainer.pictures.exposures.all_gains()).any()
