@@ -237,8 +237,9 @@ def write_mesh(
 def _write_glb_mesh(
     path: Path, vertices: Array, faces: np.ndarray, colors: np.ndarray | None, surface: VertexSurface | None
 ) -> None:
-    """Colours are COLOR_0. glTF has no roughness a vertex, but textures: one of all pairs of roughness and metallic, in
-    which a vertex's place says its own. Roughness is the square root of alpha, as in glTF (3.9.2, B.3)."""
+    """Colours are COLOR_0. What is lit has normals, without which its facets would be flat (3.7.2.1). glTF has no
+    roughness a vertex, but textures: one of all pairs of roughness and metallic, in which a vertex's place says its
+    own. Roughness is the square root of alpha, as in glTF (3.9.2, B.3)."""
     attributes = {"POSITION": vertices.astype(np.float32)}
     document: dict[str, JsonValue] = {}
     if colors is not None:
@@ -254,8 +255,19 @@ def _write_glb_mesh(
     elif colors is not None:
         material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
+    if surface is not None or colors is None:
+        attributes["NORMAL"] = _vertex_normals(vertices, faces)
     primitive = faces.ravel().astype(np.uint32), {"material": 0}
     write_glb(path, attributes, TRIANGLES, [primitive], {"materials": [material], **document})
+
+
+def _vertex_normals(vertices: Array, faces: np.ndarray) -> np.ndarray:
+    """[V, 3] float32, unit: of the faces around each vertex by their angles there; +z of a vertex that has none."""
+    import trimesh
+
+    normals = trimesh.Trimesh(vertices, faces, process=False, validate=False).vertex_normals
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 0.5, normals / np.maximum(length, 0.5), (0.0, 0.0, 1.0)).astype(np.float32)
 
 
 def _texture_of_surfaces() -> dict[str, JsonValue]:

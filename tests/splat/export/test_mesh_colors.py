@@ -134,6 +134,23 @@ def test_materials_in_gltf_are_lit(tmp_path):
     np.testing.assert_allclose(metal, metallic, atol=1e-4)
 
 
+def test_what_is_lit_in_gltf_has_normals(tmp_path):
+    """Outwards, in the file's axes, and of unit length where a vertex has no face; what holds its light needs none."""
+    mesh = trimesh.creation.icosphere(3)
+    vertices, faces = np.concatenate([mesh.vertices, [[5.0, 0, 0]]]), np.array(mesh.faces)
+    grey = np.full((len(vertices), 3), 0.5)
+    surface = VertexSurface(np.full(len(vertices), 0.5), np.zeros(len(vertices)))
+    for name, given in (("lit", (grey, None, surface)), ("plain", ()), ("unlit", (grey,))):
+        write_mesh(tmp_path / "a.glb", vertices, faces, *given)
+        document, body = glb_chunks(tmp_path / "a.glb")
+        (primitive,) = document["meshes"][0]["primitives"]
+        arrays = {key: glb_array(document, body, index) for key, index in primitive["attributes"].items()}
+        assert ("NORMAL" in arrays) == (name != "unlit")
+        if name != "unlit":
+            np.testing.assert_allclose(np.linalg.norm(arrays["NORMAL"], axis=1), 1, atol=1e-6)
+            assert (np.einsum("vi,vi->v", arrays["NORMAL"], arrays["POSITION"])[:-1] > np.cos(np.radians(1))).all()
+
+
 def test_trimesh_finds_a_vertex_in_the_texture_of_materials(tmp_path):
     mesh = trimesh.creation.icosphere(2)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
