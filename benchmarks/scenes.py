@@ -90,13 +90,19 @@ def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:
     cells["BER, no shadows"] = mean(without, "unseen_suns", "shadow", "ber").mean()
     cells["BER"] = mean(method, "unseen_suns", "shadow", "ber").mean()
     cells["mask error"] = mean(method, "unseen_suns", "shadow_mask", "error_rate").mean()
+    cells["pooled"] = mean(method, "unseen_suns", "shadow_mask", "error_rate", "pooled").mean()
+    cells["facing away, pooled"] = mean(method, "unseen_suns", "shadow_attached", "error_rate", "pooled").mean()
+    cells["albedo"] = mean(method, "material", "albedo_error").mean()
+    cells["normals"] = mean(method, "material", "normals_deg").mean()
     cells = {key: round(float(value), 4) for key, value in cells.items()}
     return cells | {"Gaussians": int(np.mean([result["model"]["gaussians"] for result in method]))}
 
 
-def mean(results: list[common.Row], part: str, group: str, metric: str) -> np.ndarray:
-    """The metric's mean over frames of known or unseen Suns, of each training; NaN where it has none."""
-    return np.array([common.number_in(result, part, group, metric, "mean") for result in results], float)
+def mean(results: list[common.Row], *names: str) -> np.ndarray:
+    """Of each training the metric with these names, its mean over frames unless the last is "pooled"; NaN where it has
+    none."""
+    names = names if names[-1] == "pooled" else (*names, "mean")
+    return np.array([common.number_in(result, *names) for result in results], float)
 
 
 if __name__ == "__main__":

@@ -49,6 +49,11 @@ COLUMNS = (  # heading, group, metric, and what of it if not the mean
     ("balanced", "shadow_mask", "balanced_error_rate"),
     ("IoU", "shadow_mask", "iou"),
 )
+MATERIAL = (  # heading, metric: over all Suns
+    ("albedo error", "albedo_error"),
+    ("normals", "normals_deg"),
+    ("learned normals", "learned_normals_deg"),
+)
 
 
 def main() -> None:
@@ -85,6 +90,8 @@ def main() -> None:
         for label, part in SUNS.items()
         if any(metrics.get(part) for metrics in results.values())
     }
+    if any(metrics.get("material") for metrics in results.values()):
+        tables["Materials"] = [material_row(name, metrics) for name, metrics in results.items()]
     common.emit({"rows": tables, "data": str(dataset.root)}, tables, options)
 
 
@@ -129,6 +136,8 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)
+    yield "map, surface, no discs", replace(mapped, surfels=False)
+    yield "splat, surface, no discs", replace(splatted, surfels=False)
     yield "splat, surface, no gloss", with_settings(splatted, {"light.gloss": False})
     every = {"split_screen": "all", "split_screen_size": mapped.refinement.split_screen_size}
     yield "splat, surface, sizes not held", with_settings(splatted, {"refinement": every, "light.shadow.bias": 5.0})
@@ -219,6 +228,12 @@ def row(name: str, metrics: dict[str, Any], part: str) -> common.Row:
         number = common.number_in(metrics, part, group, metric, what[0] if what else "mean")
         cells[heading] = "" if number is None else f"{number:.{2 if metric == 'psnr' else 4}f}"
     return cells
+
+
+def material_row(name: str, metrics: dict[str, Any]) -> common.Row:
+    """Means over all test frames."""
+    numbers = {heading: common.number_in(metrics, "material", metric, "mean") for heading, metric in MATERIAL}
+    return {"method": name, **{key: "" if value is None else f"{value:.4g}" for key, value in numbers.items()}}
 
 
 if __name__ == "__main__":

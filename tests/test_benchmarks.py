@@ -387,6 +387,7 @@ def test_shadows_compares_methods_and_goes_on_where_it_stopped(command, small_li
     assert [row["method"] for row in both["rows"]["Unseen Suns"]] == ["none", "map"]
     assert both["rows"]["Unseen Suns"][0]["mask error"] == "", "no shadows are predicted"
     assert 0 <= float(both["rows"]["Unseen Suns"][1]["mask error"]) <= 1
+    assert [0 < float(row["normals"]) < 180 for row in both["rows"]["Materials"]] == [True, True]
     assert (place / "RUNS/report.html").exists()
 
 

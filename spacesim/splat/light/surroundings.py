@@ -102,7 +102,9 @@ class Surroundings:
 
     def of(self, source: UInt32, count: int) -> "Surroundings":
         """What Gaussians see each of which was `source` [M] of the `count` that saw this. One that emits and has gone
-        does so from the place of the emitter before it, which is mostly near."""
+        does so from the place of the emitter before it, which is mostly near. Raises MemoryError as `look_around`."""
+        pairs = dr.width(self.seen) // count
+        _check_memory(pairs, dr.width(source))
         sources = source.numpy()
         first = np.full(count, GONE, np.uint32)
         first[sources[::-1]] = np.arange(len(sources), dtype=np.uint32)[::-1]  # the first of several is written last
@@ -113,7 +115,7 @@ class Surroundings:
         else:
             numbers = np.where(is_gone, np.argmin(is_gone), np.arange(len(emitters)))
             emitters = emitters[np.maximum.accumulate(numbers)]
-        pairs, before, now = dr.width(self.seen) // count, *(dr.opaque(ad.UInt32, n) for n in (count, len(sources)))
+        before, now = (dr.opaque(ad.UInt32, n) for n in (count, len(sources)))
         slot = dr.arange(ad.UInt32, pairs * len(sources))
         seen = dr.gather(ad.UInt32, self.seen, slot // now * before + dr.gather(ad.UInt32, source, slot % now))
         dr.eval(seen)
@@ -189,7 +191,7 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     not fit into memory."""
     directions, count = fibonacci_sphere(ray_count(emitters)), len(surfaces.means)
     pairs = len(directions) // 2
-    check_free_memory(4 * pairs * count, f"light that bounces onto {count} Gaussians")
+    _check_memory(pairs, count)
     rows = [upload(row) for row in directions.reshape(pairs, 6).T]
     packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
     shapes = _Shapes.of(surfaces, radius)
@@ -202,6 +204,11 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     result = Surroundings(upload(numbers, ad.UInt32), seen, packed)
     dr.eval(result)
     return result
+
+
+def _check_memory(pairs: int, count: int) -> None:
+    """Raise MemoryError where `Surroundings.seen` of so many pairs of rays does not fit into memory."""
+    check_free_memory(4 * pairs * count, f"light that bounces onto {count} Gaussians")
 
 
 @dataclass

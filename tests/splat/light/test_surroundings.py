@@ -121,6 +121,10 @@ def test_too_many_rays_for_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda needed=0: 2 * LEAST_RAYS * 5 - 1)
     with pytest.raises(MemoryError, match="light that bounces onto 5 Gaussians needs about"):
         look_around(surfaces(5), 10, RADIUS)
+    monkeypatch.setattr(memory, "free_memory", lambda needed=0: 2 * LEAST_RAYS * 5)
+    seen = look_around(surfaces(5), 10, RADIUS)
+    with pytest.raises(MemoryError, match="light that bounces onto 6 Gaussians needs about"):
+        seen.of(upload(np.array([0, 1, 2, 3, 4, 4]), ad.UInt32), 5)
 
 
 def test_few_emitters_stand_for_what_is_near():
