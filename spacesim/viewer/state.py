@@ -12,7 +12,8 @@ from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.pose import Pose
 
-MODES = ("colour", "depth", "accumulation", "visibility", "normals", "albedo", "object id", "ellipsoids")
+MATERIALS = ("albedo", "specular", "roughness", "metallic")  #: modes that show what surfaces are made of
+MODES = ("colour", "depth", "accumulation", "visibility", "normals", *MATERIALS, "object id", "ellipsoids")
 COMPARISONS = ("off", "wipe", "beside", "difference")
 SIDES = (256, 512, 768, 1024, 1536, 2048)  #: pixels of a picture's longer side at rest that clients may choose
 MAX_WINDOW_SIDE = 8192  #: pixels a side of a client's window: more is nonsense

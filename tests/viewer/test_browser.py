@@ -14,7 +14,7 @@ from spacesim.splat.compose import Pose
 from spacesim.viewer.drawing.frames import draw_mode, picture_size
 from spacesim.viewer.drawing.paint import PALETTE
 from spacesim.viewer.panels.handles import GIZMO, SUN_AWAY
-from spacesim.viewer.state import MODES
+from spacesim.viewer.state import MATERIALS, MODES
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def test_a_mixed_scene_is_refined_when_still(mixed, mixed_tab, monkeypatch):
 
 def test_all_modes_of_a_mixed_scene_can_be_seen(mixed, mixed_tab):
     options = mixed_tab.client.controls.mode.options
-    assert set(options) == set(MODES) - {"albedo", "ellipsoids"}
+    assert set(options) == set(MODES) - {*MATERIALS, "ellipsoids"}
     shown = {}
     for mode in options:
         choose_mode(mixed_tab, mode)

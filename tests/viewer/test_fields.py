@@ -27,7 +27,7 @@ from spacesim.viewer.drawing.loop import AbandonedError, RenderLoop, RenderReque
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.load import load_setup
 from spacesim.viewer.session import Session
-from spacesim.viewer.state import MODES, DisplaySettings, SceneState, SharedScene
+from spacesim.viewer.state import MATERIALS, MODES, DisplaySettings, SceneState, SharedScene
 
 SMALL = GridConfig(2, 4, 8, 8)
 CONFIG = NerfConfig(
@@ -79,7 +79,7 @@ def made(fields, state):
 
 def test_what_a_scene_of_fields_has(fields, state):
     assert (fields.progressive, fields.content, fields.gaussian_count) == (True, "2 radiance fields", 0)
-    assert fields.modes == tuple(mode for mode in MODES if mode not in ("albedo", "ellipsoids"))
+    assert fields.modes == tuple(mode for mode in MODES if mode not in (*MATERIALS, "ellipsoids"))
     centre, radius = fields.bounds(state)
     with pytest.raises(InputError, match="expected Gaussians alone, to read materials, found a radiance field"):
         fields.composition.draw_material(view_from(-5, 0).camera(16, 16))
@@ -98,7 +98,7 @@ def test_modes(fields, state, mode):
         alone = replace(state, poses=state.poses[:1])
         assert frame.picture.any()
         frame = draw_frame(single, alone, view_from(-5, 0), DisplaySettings(mode, side=256), 0.25)
-    if mode in ("visibility", "albedo", "ellipsoids"):
+    if mode in ("visibility", *MATERIALS, "ellipsoids"):
         assert frame.note.startswith(f"no {mode} to be seen: ")
         assert not frame.picture.any()
     elif mode != "object id":  # fog covers less than half

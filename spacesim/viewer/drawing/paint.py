@@ -11,6 +11,7 @@ from spacesim.data.images.color import srgb_from_linear
 from spacesim.data.images.sheet import font
 from spacesim.eval.pictures import depth_colors, error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
+from spacesim.viewer.state import MATERIALS
 
 Bytes = NDArray[np.uint8]
 
@@ -34,6 +35,9 @@ class Planes:
     visibility: np.ndarray | None = None  #: [H, W] of the Sun
     normal: np.ndarray | None = None  #: [H, W, 3] world axes, 0 where there is none
     albedo: np.ndarray | None = None  #: [H, W, 3] linear reflectance, 0 where there is no surface
+    specular: np.ndarray | None = None  #: [H, W, 3] linear reflectance of facets, 0 where none are seen
+    roughness: np.ndarray | None = None  #: [H, W] alpha of GGX
+    metallic: np.ndarray | None = None  #: [H, W] share of metals
     object_id: np.ndarray | None = None  #: [H, W] uint8, from 1, 0 none
 
 
@@ -43,7 +47,7 @@ NEEDED = {
     "accumulation": "alpha",
     "visibility": "visibility",
     "normals": "normal",
-    "albedo": "albedo",
+    **{name: name for name in MATERIALS},
     "object id": "object_id",
     "ellipsoids": "rgb",
 }
@@ -70,8 +74,10 @@ def paint(planes: Planes, mode: str, depths: tuple[float, float] | None = None) 
         if mode == "object id":
             return _colors_by_id(values)
         alpha = _clip_to_unit(planes.alpha)
-        if mode == "albedo":
+        if mode in ("albedo", "specular"):
             return _bytes(_clip_to_unit(srgb_from_linear(_clip_to_unit(values)) * alpha[..., None]))
+        if mode in ("roughness", "metallic"):
+            return np.repeat(_bytes(_clip_to_unit(values) * alpha)[..., None], 3, axis=-1)
         if mode == "accumulation":
             return np.repeat(_bytes(alpha)[..., None], 3, axis=-1)
         if mode == "depth":

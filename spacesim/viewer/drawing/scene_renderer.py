@@ -18,9 +18,9 @@ from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.output import planes_image
 from spacesim.viewer.drawing.ellipsoids import draw_ellipsoids
 from spacesim.viewer.drawing.paint import NEEDED, Planes
-from spacesim.viewer.state import MODES, SceneState
+from spacesim.viewer.state import MATERIALS, MODES, SceneState
 
-OF_GAUSSIANS = "albedo", "ellipsoids"  #: modes of scenes of Gaussians alone
+OF_GAUSSIANS = *MATERIALS, "ellipsoids"  #: modes of scenes of Gaussians alone
 MIN_RADIUS = 1e-6  #: metres of a model, where all its Gaussians are in one place
 
 
@@ -84,9 +84,9 @@ class SceneRenderer:
             size = camera.width, camera.height
             rgb, transmittance = planes_image(blended.planes, *size), planes_image([blended.transmittance], *size)
             return Planes(1 - transmittance[..., 0], rgb=rgb)
-        if mode == "albedo":
+        if mode in MATERIALS:
             materials = scene.draw_material(camera)
-            return Planes(materials.alpha, albedo=materials.albedo)
+            return Planes(materials.alpha, **{mode: getattr(materials, mode)})
         outputs = {"rgb": "rgb", "depth": "depth", "visibility": "visibility", "normal": "normal", "object_id": "id"}
         name = NEEDED[mode]
         drawn = scene.draw(camera, state.sun, [outputs[name]] if name in outputs else [], supersample=1)

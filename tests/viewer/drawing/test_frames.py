@@ -281,7 +281,8 @@ def test_planes_that_are_not_finite_are_painted():
     bad = np.full((8, 8), np.nan, np.float32)
     for mode in MODES:
         rows = np.stack([bad] * 3, -1)
-        planes = Planes(bad, rgb=rows, depth=bad, visibility=bad, normal=rows, albedo=rows)
+        planes = Planes(bad, rgb=rows, depth=bad, visibility=bad, normal=rows, albedo=rows, specular=rows)
+        planes = replace(planes, roughness=bad, metallic=bad)
         picture = paint(planes, mode)
         assert picture is None or picture.shape == (8, 8, 3)
 
@@ -316,6 +317,9 @@ def test_pictures_are_what_their_formulas_say(mode):
         visibility=rng.uniform(-0.2, 1.3, shape).astype(np.float32),
         normal=normal,
         albedo=rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32),
+        specular=rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32),
+        roughness=rng.uniform(-0.2, 1.3, shape).astype(np.float32),
+        metallic=rng.uniform(-0.2, 1.3, shape).astype(np.float32),
         object_id=rng.integers(0, 20, shape).astype(np.int32),
     )
     near, far = 3.0, 7.0
@@ -335,7 +339,9 @@ def test_pictures_are_what_their_formulas_say(mode):
             expected = cover * (seen * np.array(LIT, float) + (1 - seen) * np.array(SHADOWED, float))
         elif mode == "normals":
             expected = np.clip(255 * cover * (0.5 + 0.5 * value.astype(float)) * value.any(), 0, 255)
-        elif mode == "albedo":
+        elif mode in ("roughness", "metallic"):
+            expected = np.full(3, 255 * cover * min(max(float(value), 0), 1))
+        elif mode in ("albedo", "specular"):
             expected = 255 * cover * srgb_from_linear(value.astype(float))
         else:
             expected = np.array(PALETTE[(value - 1) % 7] if value else (0, 0, 0))
