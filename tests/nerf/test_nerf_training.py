@@ -162,6 +162,16 @@ def test_pictures_beside_the_box_are_left_out_in_one_sentence(dataset, caplog):
         training_pixels(replace(dataset, train=tuple(turned)), box, False)
 
 
+def test_exposures_that_a_field_does_not_know_are_named(dataset, caplog):
+    box = scene_box(dataset, CONFIG.margin)
+    training_pixels(dataset, box, False)
+    assert not caplog.records
+    exposed = tuple(replace(frame, exposure=0.001 * (1 + i % 2)) for i, frame in enumerate(dataset.train))
+    training_pixels(replace(dataset, train=exposed), box, False)
+    (record,) = caplog.records
+    assert "pictures name several exposures, which a radiance field takes for one" in record.message
+
+
 def test_damaged_checkpoints_are_refused(dataset, tmp_path):
     trainer = NerfTrainer(dataset, CONFIG)
     path = tmp_path / "good.safetensors"

@@ -53,6 +53,9 @@ def training_pixels(dataset: Dataset, box: SceneBox, suns: bool) -> Pixels:
             )
     if suns:
         dataset = replace(dataset, train=tuple(dataset.train[number] for number in sunlit_frames(dataset, whole=True)))
+    exposures = {frame.exposure for frame in dataset.train}
+    if len(exposures) > 1:
+        log.warning("%s: pictures name several exposures, which a radiance field takes for one", dataset.root)
     parts: list[tuple[np.ndarray, ...]] = []
     outside: list[str] = []
     for number, frame in enumerate(dataset.train):
