@@ -81,27 +81,25 @@ def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:
     notes = [result["note"] for result in without + method if "note" in result]
     if notes:
         return {"note": notes[0]}
-    base, ours = (mean(results, "unseen_suns", "image", "psnr") for results in (without, method))
-    known = mean(method, "known_suns", "image", "psnr")
+    base, ours = (values(results, "unseen_suns", "image", "psnr", "mean") for results in (without, method))
+    known = values(method, "known_suns", "image", "psnr", "mean")
     cells: common.Row = {"no shadows": base.mean(), "PSNR": ours.mean(), "gain": (ours - base).mean()}
     if len(ours) > 1:
         cells["gain, deviation"] = (ours - base).std(ddof=1)
     cells["gap"] = (known - ours).mean()
-    cells["BER, no shadows"] = mean(without, "unseen_suns", "shadow", "ber").mean()
-    cells["BER"] = mean(method, "unseen_suns", "shadow", "ber").mean()
-    cells["mask error"] = mean(method, "unseen_suns", "shadow_mask", "error_rate").mean()
-    cells["pooled"] = mean(method, "unseen_suns", "shadow_mask", "error_rate", "pooled").mean()
-    cells["facing away, pooled"] = mean(method, "unseen_suns", "shadow_attached", "error_rate", "pooled").mean()
-    cells["albedo"] = mean(method, "material", "albedo_error").mean()
-    cells["normals"] = mean(method, "material", "normals_deg").mean()
+    cells["BER, no shadows"] = values(without, "unseen_suns", "shadow", "ber", "mean").mean()
+    cells["BER"] = values(method, "unseen_suns", "shadow", "ber", "mean").mean()
+    cells["mask error"] = values(method, "unseen_suns", "shadow_mask", "error_rate", "mean").mean()
+    cells["pooled"] = values(method, "unseen_suns", "shadow_mask", "error_rate", "pooled").mean()
+    cells["facing away, pooled"] = values(method, "unseen_suns", "shadow_attached", "error_rate", "pooled").mean()
+    cells["albedo"] = values(method, "material", "albedo_error", "mean").mean()
+    cells["normals"] = values(method, "material", "normals_deg", "mean").mean()
     cells = {key: round(float(value), 4) for key, value in cells.items()}
     return cells | {"Gaussians": int(np.mean([result["model"]["gaussians"] for result in method]))}
 
 
-def mean(results: list[common.Row], *names: str) -> np.ndarray:
-    """Of each training the metric with these names, its mean over frames unless the last is "pooled"; NaN where it has
-    none."""
-    names = names if names[-1] == "pooled" else (*names, "mean")
+def values(results: list[common.Row], *names: str) -> np.ndarray:
+    """Of each training the number that stands under these names, see `common.number_in`; NaN where it has none."""
     return np.array([common.number_in(result, *names) for result in results], float)
 
 

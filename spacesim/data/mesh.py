@@ -186,6 +186,14 @@ def check_header_counts(kind: str, data: bytes) -> None:
                 )
 
 
+def vertex_normals(vertices: Array, faces: np.ndarray) -> Array:
+    """[V, 3] unit vectors outwards: the sum of the faces' around each vertex, weighted by area; 0 where that is 0."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.stack([np.bincount(faces.ravel(), across[:, k].repeat(3), len(vertices)) for k in range(3)], axis=1)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+
+
 def mesh_suffix(path: Path) -> str:
     """The format that a mesh's file name asks for. Raises InputError for one that `write_mesh` does not know."""
     suffix = Path(path).suffix.lower()
@@ -256,18 +264,11 @@ def _write_glb_mesh(
         material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
     if surface is not None or colors is None:
-        attributes["NORMAL"] = _vertex_normals(vertices, faces)
+        normals = vertex_normals(vertices, faces)
+        has_none = ~normals.any(axis=1, keepdims=True)  # glTF wants one of each vertex
+        attributes["NORMAL"] = np.where(has_none, (0.0, 0.0, 1.0), normals).astype(np.float32)
     primitive = faces.ravel().astype(np.uint32), {"material": 0}
     write_glb(path, attributes, TRIANGLES, [primitive], {"materials": [material], **document})
-
-
-def _vertex_normals(vertices: Array, faces: np.ndarray) -> np.ndarray:
-    """[V, 3] float32, unit: of the faces around each vertex by their angles there; +z of a vertex that has none."""
-    import trimesh
-
-    normals = trimesh.Trimesh(vertices, faces, process=False, validate=False).vertex_normals
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(length > 0.5, normals / np.maximum(length, 0.5), (0.0, 0.0, 1.0)).astype(np.float32)
 
 
 def _texture_of_surfaces() -> dict[str, JsonValue]:

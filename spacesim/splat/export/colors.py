@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from spacesim.data.geometry import Array
 from spacesim.data.images.color import srgb_from_linear
+from spacesim.data.mesh import vertex_normals
 from spacesim.data.records import Camera
 from spacesim.learning.prediction import MaterialView, Prediction
 from spacesim.splat.export.mesh import RunMesh, select_views
@@ -33,7 +34,7 @@ def color_vertices(
     depth: [H, W] metres along a camera's axis, 0 where it sees no surface;  predict: the run's picture from a
     camera;  most: views used;  progress: called with the views done and all of them
     """
-    normals = _normals(mesh)
+    normals = vertex_normals(mesh.vertices, mesh.faces)
     total, weights = np.zeros((len(mesh.vertices), channels)), np.zeros(len(mesh.vertices))
     views = select_views(cameras, most)
     for done, camera in enumerate(views):
@@ -72,13 +73,3 @@ def color_of_material(view: MaterialView) -> Prediction:
     roughness, metallic."""
     straight = np.dstack([srgb_from_linear(view.albedo), view.roughness, view.metallic])
     return Prediction(straight * view.alpha[..., None], view.alpha, np.zeros_like(view.alpha), None)
-
-
-def _normals(mesh: RunMesh) -> Array:
-    """[V, 3] unit vectors outwards: the sum of the faces' around each vertex, weighted by area."""
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack(
-        [np.bincount(mesh.faces.ravel(), across[:, k].repeat(3), len(mesh.vertices)) for k in range(3)], axis=1
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)

@@ -7,7 +7,7 @@ from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.surface import unit
 
 EVERY = 100  #: steps between two turns
-BOTH_UNTIL = 2_500  #: step of the last turn of normals: later ones cost 0.1 dB in 7,000 steps
+BOTH_UNTIL = 2_500  #: step of the last turn of normals: later ones cost 0.1 dB in 7,000 steps, 0.5 in 20,000
 SHARE = 0.1  #: of the way to the other that each turns (docs/research/geometry.md)
 
 

@@ -281,8 +281,8 @@ def test_planes_that_are_not_finite_are_painted():
     bad = np.full((8, 8), np.nan, np.float32)
     for mode in MODES:
         rows = np.stack([bad] * 3, -1)
-        planes = Planes(bad, rgb=rows, depth=bad, visibility=bad, normal=rows, albedo=rows, specular=rows)
-        planes = replace(planes, roughness=bad, metallic=bad)
+        of_rows = dict.fromkeys(("rgb", "normal", "albedo", "specular"), rows)
+        planes = Planes(bad, depth=bad, visibility=bad, roughness=bad, metallic=bad, **of_rows)
         picture = paint(planes, mode)
         assert picture is None or picture.shape == (8, 8, 3)
 

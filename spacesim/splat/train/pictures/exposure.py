@@ -1,4 +1,4 @@
-"""Exposure and white balance of each training picture: a gain of each channel, given or learned with the model.
+"""Exposure and white balance of each training picture: a gain of each channel, learned with the model.
 
     shown = exp(g) c + T b      c: blended colour;  T: transmittance;  b: background
 
@@ -8,8 +8,6 @@ Hierarchical 3DGS (Kerbl et al. 2024). All pictures brighter and a darker model 
 where it starts in each channel, at 0 but for pictures that name their exposure. Other pictures are drawn with a gain
 of 1.
 """
-
-import math
 
 import numpy as np
 
@@ -26,11 +24,11 @@ HOLD_EVERY = 50  #: steps
 
 
 class Exposures:
-    """The gains of a training's pictures. learned: whether they move from where they start"""
+    """The gains of a training's pictures."""
 
-    def __init__(self, start: Array, rate: float, iterations: int, learned: bool = True) -> None:
+    def __init__(self, start: Array, rate: float, iterations: int) -> None:
         """start: [V] gains;  rate: step size of g at the start"""
-        self.rate, self.iterations, self.learned = rate, iterations, learned
+        self.rate, self.iterations = rate, iterations
         self.numbers = PictureNumbers(len(start), 3, self._by_numbers)
         self.numbers.values += np.log(start)[:, None]
         self._mean = np.log(start).mean()
@@ -46,13 +44,11 @@ class Exposures:
 
     def learn(self, picture: int, step: int, gradient: Float) -> None:
         """gradient: Float [3] by the gains of a picture that was shown in a step, the first of which is 0"""
-        if not self.learned:
-            return
         self.numbers.learn(picture, gradient, falling(self.rate, step / self.iterations))
 
     def hold(self, steps: int) -> None:
         """After so many steps: set the mean of g to what it was at the start, if it is time to."""
-        if self.learned and (steps % HOLD_EVERY == 0 or steps == self.iterations):
+        if steps % HOLD_EVERY == 0 or steps == self.iterations:
             self.numbers.follow()
             self.numbers.values += self._mean - self.numbers.values.mean(axis=0)
 
@@ -65,17 +61,13 @@ def known_gains(dataset: Dataset, light: LightConfig | None) -> Array:
     where they name none, scene.json does not say what the others have, or radiance is learned, which has none. light:
     of the model. A gain of light f is nearly one of f^(1 / 2.4) of sRGB values. Raises InputError for an exposure that
     no camera has."""
-    development = tone_and_exposure(dataset.scene)
-    own = [exposure_value(frame.exposure) if frame.exposure else None for frame in dataset.train]
+    development, frames, curve = tone_and_exposure(dataset.scene), dataset.train, light.curve if light else None
     if development is None or (light and light.radiance):
-        return np.ones(len(own))
-    linear = light is not None and light.linear
-    base = light.exposure if light and light.linear and light.exposure is not None else development[1]
-    stops = np.array([0.0 if value is None else value - base for value in own])
-    far = next((i for i, value in enumerate(stops) if not math.fabs(value) <= MAX_EXPOSURE), None)
-    if far is not None:
-        expected = f"expected an exposure within {MAX_EXPOSURE} EV of the scene's"
-        raise InputError(
-            f"{dataset.root}: {expected}, found {dataset.train[far].exposure} in {dataset.train[far].file_path}"
-        )
-    return np.exp2(stops if linear else stops / 2.4)
+        return np.ones(len(frames))
+    base = curve.exposure if curve else development[1]
+    stops = np.array([exposure_value(frame.exposure) - base if frame.exposure else 0.0 for frame in frames])
+    far = np.flatnonzero(~(np.abs(stops) <= MAX_EXPOSURE))
+    if len(far):
+        expected, frame = f"expected an exposure within {MAX_EXPOSURE} EV of the scene's", frames[far[0]]
+        raise InputError(f"{dataset.root}: {expected}, found {frame.exposure} in {frame.file_path}")
+    return np.exp2(stops if curve else stops / 2.4)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
@@ -22,8 +23,7 @@ from spacesim.splat.train.views import TrainingView, TrainingViews
 
 
 class LearnedPictures:
-    """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them, and
-    pictures do not name exposures of their own"""
+    """poses, exposures, suns: of the training pictures, None where the configuration does not ask for them"""
 
     def __init__(
         self, dataset: Dataset, config: TrainConfig, first_suns: FirstSuns | None = None, poses: Array | None = None
@@ -47,9 +47,8 @@ class LearnedPictures:
             if poses is not None:
                 self.poses.stay(poses)
         gains = known_gains(dataset, config.light)
-        self.exposures: Exposures | None = None
-        if config.exposure_per_picture or (gains != 1).any():
-            self.exposures = Exposures(gains, rates.gains, steps, config.exposure_per_picture)
+        self.exposures = Exposures(gains, rates.gains, steps) if config.exposure_per_picture else None
+        self._known_gains = gains if (gains != 1).any() else None
         self.suns, self._antialiased = None, config.antialiased
         if config.sun == "unknown":
             assert first_suns is not None, "Suns that are unknown start somewhere"
@@ -70,7 +69,9 @@ class LearnedPictures:
 
     def gains(self, view: TrainingView) -> Float | None:
         """Float [3] that the colours of a view are multiplied by."""
-        return self.exposures.gains(view.index) if self.exposures else None
+        if self.exposures:
+            return self.exposures.gains(view.index)
+        return None if self._known_gains is None else ad.Float([float(self._known_gains[view.index])] * 3)
 
     def learn(
         self,
@@ -150,7 +151,7 @@ class LearnedPictures:
         if self.poses:
             degrees, share = np.median(self.poses.moves(), axis=0).tolist()
             summary["poses"] = {"degrees": degrees, "share_of_distance": share}
-        if self.exposures and self.exposures.learned:
+        if self.exposures:
             gains = self.exposures.all_gains().mean(axis=1)
             summary["gains"] = {"least": float(gains.min()), "most": float(gains.max())}
         if self.suns:
@@ -171,6 +172,5 @@ class LearnedPictures:
         return sentences
 
     def _learned(self) -> dict[str, PoseRefinement | Exposures | SunEstimation]:
-        exposures = self.exposures if self.exposures and self.exposures.learned else None
-        every = {"pictures.poses": self.poses, "pictures.exposures": exposures, "pictures.suns": self.suns}
+        every = {"pictures.poses": self.poses, "pictures.exposures": self.exposures, "pictures.suns": self.suns}
         return {name: learned for name, learned in every.items() if learned is not None}

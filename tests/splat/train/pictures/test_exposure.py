@@ -155,9 +155,12 @@ def test_pictures_of_named_exposures_train_a_nearer_model(named):
     nameless = replace(dataset, train=tuple(replace(frame, exposure=None) for frame in dataset.train))
     without, trainer = trained(nameless, config), trained(dataset, config)
     assert without.pictures.exposures is None
-    np.testing.assert_allclose(trainer.pictures.exposures.all_gains(), gains[:, None] ** (1 / 2.4) * np.ones(3))
+    assert without.pictures.gains(without.views[0]) is None
+    given = np.array([trainer.pictures.gains(trainer.views[i]) for i in range(len(gains))])
+    np.testing.assert_allclose(given, gains[:, None] ** (1 / 2.4) * np.ones(3))
+    assert trainer.pictures.exposures is None
     assert trainer.pictures.cameras() is None
     assert psnr_of_tests(trainer, dataset) > psnr_of_tests(without, dataset) + 0.5
     learned = trained(dataset, replace(config, exposure_per_picture=True)).pictures.exposures.all_gains()
     np.testing.assert_allclose(np.log(learned).mean(axis=0), np.log(gains).mean() / 2.4, atol=1e-9)
-    assert (learned != trainer.pictures.exposures.all_gains()).any()
+    assert (np.abs(learned / given - 1) > 1e-3).any()
