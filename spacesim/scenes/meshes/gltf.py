@@ -17,6 +17,7 @@ from spacesim.data.files import JsonDict, read_bytes
 from spacesim.scenes.meshes.gltf_surface import UV_SET, Surfaces
 from spacesim.scenes.meshes.parts import RawPart
 from spacesim.scenes.meshes.textures import MAX_FILE_BYTES, Folder, Notes, decode_data_uri
+from spacesim.scenes.meshes.vertex_colors import at_corners, painted
 
 MAX_IMPLIED_BYTES = 1 << 24  #: bytes of an accessor without a buffer view, all zeros but for what is sparse
 MAX_CORNERS = 30_000_000  #: of what the nodes place: ten million faces of shared vertices
@@ -249,11 +250,6 @@ def _part(
         vertices = positions @ transform[:3, :3].T + transform[:3, 3]
         mirrored = np.linalg.det(transform[:3, :3]) < 0
     surface = surfaces.of(primitive.get("material"))
-    if surface is not None and "COLOR_0" in attributes:
-        colors = file.accessor(attributes["COLOR_0"], (3, 4))[:, :3]
-        scale = np.iinfo(colors.dtype).max if colors.dtype.kind in "iu" else 1.0
-        surface = surface.tinted(np.nan_to_num(colors.astype(np.float64) / scale).mean(axis=0))
-        notes.change("colours of vertices become one mean colour of the part", surface.name)
     uv = None
     if surface is not None and surface.pictures:
         choice = surfaces.uv_set(primitive["material"])
@@ -264,7 +260,12 @@ def _part(
             surface = surface.bare()
     if mirrored:
         faces, normals = faces[:, ::-1], None if normals is None else normals[:, ::-1]
-    return RawPart("", vertices, faces, uv, surface, normals)
+    part = RawPart("", vertices, faces, uv, surface, normals)
+    if surface is None or "COLOR_0" not in attributes:
+        return part
+    colors = file.accessor(attributes["COLOR_0"], (3, 4))[:, :3]
+    scale = np.iinfo(colors.dtype).max if colors.dtype.kind in "iu" else 1.0
+    return painted(part, at_corners(colors.astype(np.float64) / scale, faces), notes)
 
 
 def _normals(file: _GltfFile, attributes: JsonDict, transform: np.ndarray, faces: np.ndarray) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from spacesim.data.mesh import MeshFolderResolver, check_header_counts
 from spacesim.scenes.materials.table import Color
 from spacesim.scenes.meshes.parts import ABSENT, RawPart
 from spacesim.scenes.meshes.textures import NORMALS, Folder, Notes, Surface, check_picture, clip_to_unit, decode_image
+from spacesim.scenes.meshes.vertex_colors import at_corners, painted
 
 _UNUSED = ("ke", "map_ke", "map_ks", "map_ka", "map_bump", "bump", "map_d", "disp", "norm", "map_ns", "refl")
 
@@ -50,7 +51,9 @@ def read_table(path: Path, notes: Notes) -> list[RawPart]:
                 notes.drop("textures of parts without texture coordinates are not used", surface.name)
                 surface = surface.bare()
             normals = _normals(mesh, notes) if smooth else None
-            parts.append(RawPart(part_name, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals))
+            part = RawPart(part_name, np.array(mesh.vertices), np.array(mesh.faces), uv, surface, normals)
+            colors = _colors(mesh)
+            parts.append(part if surface is None or colors is None else painted(part, colors, notes))
     return parts
 
 
@@ -161,13 +164,23 @@ def _normals(mesh: trimesh.Trimesh, notes: Notes) -> np.ndarray | None:
     return np.asarray(normals, dtype=np.float64)[mesh.faces]
 
 
+def _colors(mesh: trimesh.Trimesh) -> np.ndarray | None:
+    """[F, 3, 3] linear, at the corners of faces, None where neither these nor vertices have colours."""
+    visual = mesh.visual
+    if visual.kind == "vertex":
+        corners = at_corners(np.asarray(visual.vertex_colors), mesh.faces)
+    elif visual.kind == "face":
+        corners = np.asarray(visual.face_colors)[:, None].repeat(3, axis=1)
+    else:
+        return None
+    return np.asarray(linear_from_srgb(corners[..., :3] / 255.0))
+
+
 def _surface(mesh: trimesh.Trimesh, files: _Files, notes: Notes) -> Surface | None:
     visual = mesh.visual
     if visual.kind in ("vertex", "face"):
-        colors = visual.vertex_colors if visual.kind == "vertex" else visual.face_colors
-        mean = linear_from_srgb(np.asarray(colors)[:, :3] / 255.0).mean(axis=0)
-        notes.change("colours of vertices or faces become one mean colour, taken as sRGB and matt")
-        return Surface("colour", _color(mean), matt=True)
+        notes.change("colours of vertices or faces are taken as sRGB and matt")
+        return Surface("colour", matt=True)
     material = getattr(visual, "material", None)
     if material is None or type(material).__name__ != "SimpleMaterial":
         return None

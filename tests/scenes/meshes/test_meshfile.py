@@ -11,7 +11,6 @@ import trimesh
 from PIL import Image
 
 from spacesim.data.errors import InputError
-from spacesim.data.images import linear_from_srgb
 from spacesim.scenes.build import build
 from spacesim.scenes.config import UNITS
 from spacesim.scenes.generation.generate import plan_views
@@ -219,14 +218,6 @@ def test_sides_and_materials_of_a_scene_file(tmp_path, caplog):
     assert both[1].name.split("/")[1] in evaluated
     assert both[0].name.split("/")[1] not in evaluated
     assert "base colours" not in built("mesh = 'sat.obj'\nmaterials = { '*' = 'kapton' }")[1]
-
-
-def test_colors_of_a_ply_become_their_mean(tmp_path):
-    mesh = box()
-    mesh.visual.vertex_colors = np.array([[255, 0, 100, 255], [255, 255, 100, 255]] * 4, dtype=np.uint8)
-    craft, report = read_mesh(saved(mesh, tmp_path / "painted.ply"))
-    np.testing.assert_allclose(craft.parts[0].material.albedo, [1.0, 0.5, linear_from_srgb(100 / 255)], atol=1e-6)
-    assert any("mean colour" in line for line in report.changed)
 
 
 def test_no_material_gives_grey_paint_and_a_sentence(tmp_path):
