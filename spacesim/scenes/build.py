@@ -13,7 +13,7 @@ from spacesim.data.geometry import Array, rotation_from_quaternion
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials.spectra import sun_rgb
 from spacesim.scenes.materials.table import Material, customise, material
-from spacesim.scenes.meshes.parts import is_closed
+from spacesim.scenes.meshes.parts import is_closed_mesh
 from spacesim.scenes.meshes.read import make_two_sided, read_mesh
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Spacecraft, spacecraft
@@ -93,7 +93,7 @@ def _with_materials(craft: Spacecraft, item: ObjectConfig, custom: Mapping[str, 
             raise InputError(f"materials: expected a part of {craft.name}, found none that fits {pattern!r}")
         chosen = _material(name, custom)
         for i in fitting:
-            wrap = item.two_sided is True and is_closed(parts[i].mesh.faces)
+            wrap = item.two_sided is True and is_closed_mesh(parts[i].mesh)
             parts[i] = replace(parts[i], material=make_two_sided(chosen) if wrap else chosen)
     return replace(craft, parts=tuple(parts))
 

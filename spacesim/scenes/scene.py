@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import trimesh
@@ -22,6 +23,7 @@ from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.emitters import Source, earthshine, solar_disc
 from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials.table import Material
+from spacesim.scenes.meshes.parts import is_closed_mesh
 from spacesim.scenes.spacecraft import Part, Spacecraft
 
 MAX_OBJECTS, MAX_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
@@ -155,7 +157,16 @@ def _is_same_material(first: Material, second: Material) -> bool:
     return first.tile == second.tile and _describe_material(first) == _describe_material(second)
 
 
+_described: WeakKeyDictionary[Material, JsonDict] = WeakKeyDictionary()
+
+
 def _describe_material(material: Material) -> JsonDict:
+    if material not in _described:
+        _described[material] = _description(material)
+    return _described[material]
+
+
+def _description(material: Material) -> JsonDict:
     digests = {name: hashlib.sha256(image.tobytes()).hexdigest() for name, image in material.images.items()}
     described = {"albedo": list(material.albedo), "bsdf": material.bsdf, "source": material.source}
     return {**described, "images": digests} if digests else described
@@ -185,7 +196,7 @@ class MitsubaScene:
 def load(scene: Scene) -> MitsubaScene:
     """`scene` in Mitsuba: one mesh a part, flat-shaded unless it has normals of its own."""
     mi = backend.mitsuba()
-    keys = {p.shape_id: (p.part.material, not p.mesh.is_watertight) for p in scene.parts}
+    keys = {p.shape_id: (p.part.material, not is_closed_mesh(p.part.mesh)) for p in scene.parts}
     bsdfs = {key: _mitsuba_bsdf(*key) for key in dict.fromkeys(keys.values())}
     units = Units.of(scene.bounding_sphere)
     shapes = {p.shape_id: _mitsuba_mesh(p, units, bsdfs[keys[p.shape_id]]) for p in scene.parts}

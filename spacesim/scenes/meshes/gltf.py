@@ -261,7 +261,10 @@ def _part(
     if mirrored:
         faces, normals = faces[:, ::-1], None if normals is None else normals[:, ::-1]
     part = RawPart("", vertices, faces, uv, surface, normals)
-    if surface is None or "COLOR_0" not in attributes:
+    if "COLOR_0" not in attributes:
+        return part
+    if surface is None:
+        notes.drop("colours of vertices of parts without a material are not used")
         return part
     colors = file.accessor(attributes["COLOR_0"], (3, 4))[:, :3]
     scale = np.iinfo(colors.dtype).max if colors.dtype.kind in "iu" else 1.0

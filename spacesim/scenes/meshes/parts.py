@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import trimesh
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -69,6 +70,13 @@ def corner_ids(vertices: np.ndarray) -> np.ndarray:
 def is_closed(faces: np.ndarray) -> bool:
     """Each edge of faces [F, 3] lies between exactly two of them."""
     return bool(len(faces)) and bool((np.unique(_edges(faces), return_counts=True)[1] == 2).all())
+
+
+def is_closed_mesh(mesh: trimesh.Trimesh) -> bool:
+    """Whether a part's mesh is closed: with texture coordinates, one place may have several vertices."""
+    if mesh.is_watertight:
+        return True
+    return mesh.visual.kind == "texture" and is_closed(corner_ids(np.asarray(mesh.vertices))[mesh.faces])
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:

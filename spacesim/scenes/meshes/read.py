@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.scenes.config import UNITS, UP_AXES
 from spacesim.scenes.materials.table import Material
 from spacesim.scenes.meshes.gltf import read_gltf
-from spacesim.scenes.meshes.parts import RawPart, clean_part, corner_ids, is_closed, merge_parts
+from spacesim.scenes.meshes.parts import RawPart, clean_part, corner_ids, is_closed, is_closed_mesh, merge_parts
 from spacesim.scenes.meshes.table import read_table
 from spacesim.scenes.meshes.textures import DEFAULT_PRESET, MAX_FILE_BYTES, Notes, Surface, material_of, plain_name
 from spacesim.scenes.spacecraft import Part, Spacecraft
@@ -210,13 +210,14 @@ def _spacecraft(
     materials: dict[tuple[int, bool], Material] = {}
     parts = []
     for part, surface in zip(raw, surfaces, strict=True):
-        wrap = both_sides and is_closed(part.faces)
+        mesh = _trimesh(part)
+        wrap = both_sides and is_closed_mesh(mesh)
         key = (id(surface), wrap)
         if key not in materials:
             material = material_of(surface, name, path.name, notes)
             materials[key] = make_two_sided(material) if wrap else material
         normals = None if part.normals is None else part.normals.reshape(-1, 3)
-        parts.append(Part(part.name, _trimesh(part), materials[key], normals=normals))
+        parts.append(Part(part.name, mesh, materials[key], normals=normals))
     vertices = np.concatenate([part.vertices for part in raw])
     merged = merge_parts([replace(part, uv=None) for part in raw])
     report = MeshReport(

@@ -1,12 +1,14 @@
 """Colours of vertices are rendered as they are, in all formats that have them."""
 
 import numpy as np
+import pytest
 import trimesh
 from scenes.meshes.test_gltf import CORNERS, QUAD, SQUARE, Document, looked_up, png
 
 from spacesim.data.images import srgb_from_linear
 from spacesim.data.mesh import VertexSurface, write_mesh
 from spacesim.scenes.meshes import vertex_colors
+from spacesim.scenes.meshes.parts import is_closed_mesh
 from spacesim.scenes.meshes.read import read_mesh
 
 SLOPE = np.array([[0.8, 0, 0], [0, 0.8, 0]])  # of the colour along x and y
@@ -36,6 +38,28 @@ def test_colors_of_a_ply(tmp_path):
     plate.visual.vertex_colors = np.round(255 * srgb_from_linear(colored(SQUARE))).astype(np.uint8)
     plate.export(tmp_path / "plate.ply")
     np.testing.assert_allclose(looked_up(tmp_path / "plate.ply", POINTS), colored(POINTS), atol=0.01)
+
+
+def test_faces_of_four_corners_become_their_mean(tmp_path):
+    """trimesh has one colour for each of them, and two triangles."""
+    head = "ply\nformat ascii 1.0\nelement vertex 6\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 2\nproperty list uchar int vertex_indices\n"
+    head += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    places = "".join(f"{x} {y} 0\n" for y in (0, 1) for x in (0, 1, 2))
+    (tmp_path / "a.ply").write_text(head + places + "4 0 1 4 3 255 0 0\n4 1 2 5 4 0 0 255\n")
+    craft, report = read_mesh(tmp_path / "a.ply")
+    assert len(craft.parts[0].mesh.faces) == 4
+    assert any("mean colour" in line for line in report.changed)
+
+
+def test_closed_parts_stay_closed_and_their_mean_is_that_of_their_colors(tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=1)
+    colors = np.random.default_rng(0).uniform(0.1, 0.8, (len(sphere.vertices), 3))
+    write_mesh(tmp_path / "a.ply", sphere.vertices, sphere.faces, srgb_from_linear(colors))
+    part = read_mesh(tmp_path / "a.ply")[0].parts[0]
+    assert not part.mesh.is_watertight
+    assert is_closed_mesh(part.mesh)
+    np.testing.assert_allclose(part.material.albedo, colors[sphere.faces].mean(axis=(0, 1)), rtol=0.05)
 
 
 def test_colors_of_faces_end_at_edges(tmp_path):
@@ -88,7 +112,8 @@ def test_vertices_that_are_not_there_have_no_color(tmp_path):
     assert any("mean colour" in line for line in report.changed)
 
 
-def test_many_faces_become_their_mean(tmp_path, monkeypatch):
-    monkeypatch.setattr(vertex_colors, "MAX_FACES", 1)
+@pytest.mark.parametrize(("name", "value"), [("MAX_FACES", 1), ("MAX_TEXTURE_PIXELS", 17)])
+def test_many_faces_become_their_mean(tmp_path, monkeypatch, name, value):
+    monkeypatch.setattr(vertex_colors, name, value)
     _, path = square(tmp_path, colored(SQUARE).astype("<f4"))
     assert any("mean colour" in line for line in read_mesh(path)[1].changed)
