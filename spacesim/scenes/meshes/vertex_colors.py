@@ -80,7 +80,7 @@ class _Layout:
         """As fine as so many pixels allow; None where they are too few."""
         across = int(np.ceil(np.sqrt(faces)))
         down = -(-faces // across)
-        side = min(int(np.sqrt(min(pixels, PIXELS) / (across * down))), MOST, MAX_TEXTURE_SIDE // across)
+        side = min(int(np.sqrt(max(min(pixels, PIXELS), 0) / (across * down))), MOST, MAX_TEXTURE_SIDE // across)
         if side < LEAST and LEAST**2 * across * down <= pixels:
             side = LEAST  # of many faces
         return _Layout(across, down, side) if side >= LEAST else None

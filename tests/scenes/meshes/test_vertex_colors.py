@@ -112,7 +112,7 @@ def test_vertices_that_are_not_there_have_no_color(tmp_path):
     assert any("mean colour" in line for line in report.changed)
 
 
-@pytest.mark.parametrize(("name", "value"), [("MAX_FACES", 1), ("MAX_TEXTURE_PIXELS", 17)])
+@pytest.mark.parametrize(("name", "value"), [("MAX_FACES", 1), ("MAX_TEXTURE_PIXELS", 17), ("MAX_TEXTURE_PIXELS", -1)])
 def test_many_faces_become_their_mean(tmp_path, monkeypatch, name, value):
     monkeypatch.setattr(vertex_colors, name, value)
     _, path = square(tmp_path, colored(SQUARE).astype("<f4"))
