@@ -10,11 +10,14 @@ from typing import cast
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
-from spacesim.backend.arrays import Float, TensorXf
+from spacesim.backend import ad, select
+from spacesim.backend.arrays import Bool, Float, TensorXf, UInt32
+from spacesim.learning.joined import Joined
 
 MAX_FEATURES, MAX_WIDTH, MAX_LAYERS = 1024, 4096, 32
 """Of a network: numbers a Gaussian, units of a layer, layers, far above any that pays."""
+GROUPS = 8  #: of matrices that are summed up at the same time, on CUDA
+FEW = 4  #: rows of a matrix at which products by tiles are slow, on CUDA
 ALIGNED = 4  #: rows of matrices are a multiple of it
 
 
@@ -96,7 +99,10 @@ def forward(
         if i == 0:
             common = ad.TensorXf(weights[0], (rows, shape.shared))
             bias = bias + _product(common, ad.TensorXf(shared, (shape.shared, 1)))
-        value = _product(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
+        if i > 0 and rows <= FEW and select() == "cuda":
+            value = _product_of_few(weights[1 + 2 * i], rows, value) + bias
+        else:
+            value = _product(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
         if first_layer and i == 0:
             value += first_layer.values
         if i < shape.layers - 1:
@@ -114,22 +120,19 @@ def backward(
     Sums over N are sums over the columns of each matrix, all at once, then over the matrices, each in a fixed order:
     the same bits in every run.
     """
-    gradients: dict[int, Float] = {}
+    parts: list[Float] = []  # of each matrix, of the last layer first: gradients of the bias, of the weights
     grad_values = grad_output
     for i in reversed(range(shape.layers)):
-        rows, columns = shape.sizes[i]
-        grad_bias = _over_matrices(dr.block_reduce(dr.ReduceOp.Add, grad_values.array, grad_values.shape[2]), rows)
-        products = _product(grad_values, tape[i], Bt=True)
-        grad_matrix = _over_matrices(products.array, rows * tape[i].shape[1])
-        gradients[1 + 2 * i] = _columns(grad_matrix, rows, tape[i].shape[1], columns)
-        gradients[2 + 2 * i] = grad_bias
-        if i == 0:
-            outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
-            gradients[0] = outer.array
+        parts.append(dr.block_reduce(dr.ReduceOp.Add, grad_values.array, grad_values.shape[2]))
+        parts.append(_product(grad_values, tape[i], Bt=True).array)
         grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
-    return [gradients[i] for i in range(len(weights))], grad_values
+    sums = _over_matrices(parts, grad_output.shape[0])[::-1]
+    (rows, columns), grad_bias = shape.sizes[0], sums[1]
+    sums[0] = _columns(sums[0], rows, tape[0].shape[1], columns)
+    outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
+    return [outer.array, *sums], grad_values
 
 
 def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float]) -> Float:
@@ -165,11 +168,59 @@ def _product(left: TensorXf, right: TensorXf, At: bool = False, Bt: bool = False
     return cast(TensorXf, dr.matmul(left, right, At=At, Bt=Bt))
 
 
-def _over_matrices(numbers: Float, size: int) -> Float:
-    """Float [size]: sum of B times `size` numbers."""
-    count = dr.width(numbers) // size
-    total = _product(dr.full(ad.TensorXf, 1, (1, count)), ad.TensorXf(numbers, (count, size)))
-    return total.array
+def _over_matrices(parts: list[Float], matrices: int) -> list[Float]:
+    """Sums over all matrices of what each of them gives: of parts [B * size] Floats [size]."""
+    sizes = [dr.width(part) // matrices for part in parts]
+    if select() == "llvm":
+        ones = dr.full(ad.TensorXf, 1, (1, matrices))
+        rows = zip(parts, sizes, strict=True)
+        return [_product(ones, ad.TensorXf(part, (matrices, size))).array for part, size in rows]
+    joined = Joined(sizes)
+    entry = dr.arange(ad.UInt32, GROUPS * joined.size)
+    place, group = entry % joined.size, entry // joined.size
+
+    def has_more(k: UInt32, _total: Float) -> Bool:
+        return k < matrices
+
+    def add(k: UInt32, total: Float) -> tuple[UInt32, Float]:
+        return k + GROUPS, total + joined.load(parts, place, k)
+
+    state = group, dr.zeros(ad.Float, GROUPS * joined.size)
+    _, totals = dr.while_loop(state, has_more, add, mode="symbolic", label="sum over matrices")
+    dr.eval(totals)
+    place = dr.arange(ad.UInt32, joined.size)
+    of_groups = [dr.gather(ad.Float, totals, i * joined.size + place) for i in range(GROUPS)]
+    return joined.split(sum(of_groups[1:], of_groups[0]))
+
+
+def _product_of_few(matrix: Float, rows: int, items: TensorXf) -> TensorXf:
+    """`_product` of a matrix of so few `rows`, Float [rows * C], with items [B, C, m] in one pass over these."""
+    matrices, columns, m = items.shape
+    turn = _turn(columns)
+    column = dr.arange(ad.UInt32, matrices * m)
+    number, within = column // m, column % m
+
+    def has_more(k: UInt32, _sums: list[Float]) -> Bool:
+        return k < columns
+
+    def add(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
+        for u in range(turn):
+            value = dr.gather(ad.Float, items.array, (number * columns + k + u) * m + within)
+            weights = [dr.gather(ad.Float, matrix, i * columns + k + u) for i in range(rows)]
+            sums = [dr.fma(weight, value, total) for weight, total in zip(weights, sums, strict=True)]
+        return k + turn, sums
+
+    state = ad.UInt32(0), [ad.Float(0) for _ in range(rows)]
+    _, sums = dr.while_loop(state, has_more, add, mode="symbolic", label="product of few rows")
+    result = dr.empty(ad.Float, rows * matrices * m)
+    for i, total in enumerate(sums):
+        dr.scatter(result, total, (number * rows + i) * m + within, mode=dr.ReduceMode.NoConflicts)
+    return ad.TensorXf(result, (matrices, rows, m))
+
+
+def _turn(count: int) -> int:
+    """How many of `count` numbers a loop takes a turn."""
+    return next(turn for turn in (8, 4, 2, 1) if count % turn == 0)
 
 
 def round_up_rows(rows: int) -> int:

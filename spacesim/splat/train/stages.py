@@ -9,6 +9,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
+from spacesim.learning.joined import Joined
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project
@@ -158,9 +159,14 @@ def update_light(
     weights. factors: Float [3] or, with embeddings, [4]: two corrections, the networks' step size, the embeddings'"""
     count = dr.width(factors)
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(count)]
-    rates = [numbers[2]] * (len(weights) - count + 3) + numbers[3:]
-    means = [mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
-    return adam_step(weights, means, moments, rates, (numbers[0], numbers[1]))
+    joined = Joined([dr.width(weight) for weight in weights])
+    rates = joined.repeat([numbers[2]] * (len(weights) - count + 3) + numbers[3:])
+    gradient = mean([joined.load(of_view) for of_view in gradients])
+    first, second = (joined.load(arrays) for arrays in moments)
+    corrections = numbers[0], numbers[1]
+    of_all = adam_step([joined.load(weights)], [gradient], ([first], [second]), [rates], corrections)
+    moved, first_moments, second_moments = (joined.split(row) for [row] in of_all)
+    return moved, first_moments, second_moments
 
 
 def mean(values: list[Float]) -> Float:

@@ -1,0 +1,46 @@
+"""Arrays of different sizes in one kernel: what is small takes as long to launch as to compute."""
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+import drjit as dr
+
+from spacesim.backend import ad
+from spacesim.backend.arrays import Float, UInt32
+
+
+class Joined:
+    """Arrays of `sizes` numbers, one after another as one row [S]; may be part of a recording."""
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self.size = sum(sizes)
+        self._parts = list(zip(accumulate(sizes[:-1], initial=0), sizes, strict=True))
+
+    def load(self, arrays: Sequence[Float], place: UInt32 | None = None, row: UInt32 | int = 0) -> Float:
+        """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`."""
+        place = self._all() if place is None else place
+        values = ad.Float(0)
+        for array, (first, size) in zip(arrays, self._parts, strict=True):
+            own = (place >= first) & (place < first + size)
+            values += dr.gather(ad.Float, array, row * size + (place - first), own)
+        return values
+
+    def repeat(self, numbers: Sequence[Float]) -> Float:
+        """[S]: a number for all of each array."""
+        place, values = self._all(), ad.Float(0)
+        for number, (first, _) in zip(numbers, self._parts, strict=True):
+            values = dr.select(place >= first, number, values)
+        return values
+
+    def split(self, row: Float) -> list[Float]:
+        """The arrays of a row [S]."""
+        place, arrays = self._all(), []
+        for first, size in self._parts:
+            array = dr.empty(ad.Float, size)
+            own = (place >= first) & (place < first + size)
+            dr.scatter(array, row, place - first, own, dr.ReduceMode.NoConflicts)
+            arrays.append(array)
+        return arrays
+
+    def _all(self) -> UInt32:
+        return dr.arange(ad.UInt32, self.size)
