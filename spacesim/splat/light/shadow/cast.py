@@ -20,11 +20,15 @@ from spacesim.splat.light.shadow.splatting import (
     BETA_MIN,
     LEAST_BETA,
     differentiable_occlusion,
+    make_events,
+    occlude,
     occlusion_by_splatting,
 )
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.project import Footprints, Splats
+from spacesim.splat.raster.tiles import round_capacity
 
 MAX_LIGHT_SIZE = 8192  #: pixels of a side of the light's picture
 UNSEEN = -80.0  #: logit of an opacity that nothing draws
@@ -117,18 +121,20 @@ def cast_shadows(
 ) -> Shadows:
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
     distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
-    rows = gaussians.shape_rows()
-    camera = _fit(rows, light, config.size, config.crop)
-    bias, points = _receivers(rows, camera, *_numbers(config), config.grazing)
+    rows, capacity, beta_min = gaussians.shape_rows(), round_capacity(gaussians.count), _beta_min(config)
+    of_view = rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity
     if isinstance(config.method, MappingConfig):
+        view = _light_view(*of_view)
         softness = config.softness * distance
         occlusion = occlusion_by_mapping(
-            gaussians, camera, bias.bias, softness, config.method, points, make_lists=make_lists
+            gaussians, view.camera, view.bias.bias, softness, config.method, view.points, make_lists=make_lists
         )
+    elif gaussians.count == 0:
+        view, occlusion = _light_view(*of_view), dr.zeros(ad.Float, 0)
     else:
-        ends = _beta_min(config)
-        occlusion = occlusion_by_splatting(gaussians, camera, bias.bias, points, beta_min=ends, make_lists=make_lists)
-    return Shadows(occlusion, rows, camera, bias, points, _beta_min(config))
+        view, events, boxes = _light_events(*of_view, beta_min, dr.opaque(ad.UInt32, gaussians.count))
+        occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
+    return Shadows(occlusion, rows, view.camera, view.bias, view.points, beta_min)
 
 
 @dataclass
@@ -182,9 +188,48 @@ def _beta_min(config: ShadowConfig) -> float:
     return config.method.beta_min if isinstance(config.method, SplattingConfig) else BETA_MIN
 
 
+@dataclass
+class _LightView:
+    """How the Sun sees N Gaussians."""
+
+    camera: Orthographic
+    bias: Bias
+    points: Array3f | None  #: where receivers are tested, None for their centres
+
+
 @recorded
-def _fit(rows: list[Float], light: Float, size: int, crop: bool) -> Orthographic:
-    return fit_camera(Gaussians.from_rows(rows), light, size, crop)
+def _light_view(
+    rows: list[Float],
+    light: Float,
+    strength: Float,
+    reach: Float,
+    size: int,
+    crop: bool,
+    grazing: str,
+    capacity: int,
+) -> _LightView:
+    """capacity: `round_capacity` of N"""
+    camera = fit_camera(Gaussians.from_rows(rows), light, size, crop, capacity)
+    return _LightView(camera, *_receivers(rows, camera, strength, reach, grazing))
+
+
+@recorded
+def _light_events(
+    rows: list[Float],
+    light: Float,
+    strength: Float,
+    reach: Float,
+    size: int,
+    crop: bool,
+    grazing: str,
+    capacity: int,
+    beta_min: float,
+    count: UInt32,
+) -> tuple[_LightView, Splats, Footprints]:
+    """`_light_view` and `make_events`. count: N"""
+    view = _light_view(rows, light, strength, reach, size, crop, grazing, capacity)
+    dr.eval(view)
+    return view, *make_events(rows, view.points, view.camera, view.bias.bias, False, None, beta_min, count, capacity)
 
 
 @recorded

@@ -29,6 +29,7 @@ from spacesim.splat.light.shadow.light_camera import (
 )
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
+from spacesim.splat.raster.tiles import round_capacity
 
 MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at
 MAX_CAMERAS = 8  #: K of algorithm 3: the thesis does not say
@@ -65,7 +66,7 @@ def occlusion_in_clusters(
     _check(size, least_scale, most)
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop)
+    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop, round_capacity(gaussians.count))
     occlusion: Any = occlude(gaussians, camera)
     if _is_one_camera_enough(coverage, least_scale):
         return occlusion
@@ -214,11 +215,11 @@ def _is_one_camera_enough(coverage: Float, least_scale: float) -> bool:
 
 
 @recorded
-def _fitted(shapes: Shapes, light: Float, size: int, crop: bool) -> tuple[Orthographic, Float]:
+def _fitted(shapes: Shapes, light: Float, size: int, crop: bool, capacity: int) -> tuple[Orthographic, Float]:
     """(the one camera of a compact set, Float [4]: its pixels a metre in x and y, how many Gaussians have their centre
     in its image, how many can be drawn). Counts are exact to 2^24."""
     means, log_scales, quaternions, logits = shapes
-    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size, crop)
+    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size, crop, capacity)
     drawn = drawable_mask(*shapes)
     screen = camera.screen(camera.transform(dr.select(drawn, means, ad.Array3f(0))))
     inside = drawn & (screen.x >= 0) & (screen.x <= size) & (screen.y >= 0) & (screen.y <= size)

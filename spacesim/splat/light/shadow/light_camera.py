@@ -17,6 +17,7 @@ from spacesim.data.records import Sun
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.raster.project import ALPHA_MIN
+from spacesim.splat.raster.tiles import round_capacity
 
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most
@@ -59,47 +60,65 @@ def towards_sun(light: Float) -> Array3f:
     return -_axis(light, 2)
 
 
-def fit_camera(gaussians: Gaussians, light: Float, size: int, crop: bool = True) -> Orthographic:
+def fit_camera(
+    gaussians: Gaussians, light: Float, size: int, crop: bool = True, capacity: int | None = None
+) -> Orthographic:
     """The light camera of size x size pixels that holds the Gaussians' 3 sigma supports (thesis 4.29 to 4.35).
 
     light: Float [9] of `light_rows`. Pixels need not be square (4.35). The image's bounds are those of the supports,
     with `crop` at most `REACH` standard deviations of the whole (the spread of the means and of the Gaussians
     themselves) to either side of the mean, so that a stray Gaussian does not cost the others their resolution; depth
     counts from the plane through that mean. Only Gaussians that can be drawn count; of none, the image is a metre wide
-    about the world's origin. Nothing waits for the device, and the function may be part of a recording. Detached.
+    about the world's origin. Nothing waits for the device. Detached.
+    capacity: `round_capacity` of their number, which a recording that this is a part of must have as an argument
     """
     if gaussians.count == 0:
         return _camera(light, ad.Array3f(0), [(ad.Float(-0.5), ad.Float(0.5))] * 2, size)
+    assert capacity is not None or not dr.flag(dr.JitFlag.FreezingScope), "a recording is of one capacity"
+    capacity = round_capacity(gaussians.count) if capacity is None else capacity
     means, log_scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
     quaternions, logits = dr.detach(gaussians.quaternions), dr.detach(gaussians.logit_opacities)
     drawn = drawable_mask(means, log_scales, quaternions, logits)
     means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
     counted = dr.select(drawn, ad.Float(1), 0)
-    dr.eval(means, counted)  # here and below: one kernel for what several reductions read
-    share = dr.rcp(dr.maximum(dr.sum(counted), 1))
-    middle = ad.Array3f([dr.sum(means[i]) * share for i in range(3)])
+    [(total, *sums)] = _reduced(capacity, (dr.ReduceOp.Add, 0, [counted, *means]))
+    share = dr.rcp(dr.maximum(total, 1))
+    middle = ad.Array3f([axis_sum * share for axis_sum in sums])
     offset, columns, scales = means - middle, principal_axes(quaternions), dr.exp(log_scales)
-    extents = []
+    ends, squares = [], []
     for i in range(2):
         axis = _axis(light, i)
         across = dr.dot(axis, offset)
         spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
         support = SUPPORT * dr.sqrt(spread2)  # 4.31
-        low, high = (
-            dr.select(drawn, across - support, MAX_MAGNITUDE),
-            dr.select(drawn, across + support, -MAX_MAGNITUDE),
-        )
-        extents.append((low, high, counted * dr.fma(across, across, spread2)))
-    dr.eval(extents)
+        ends += [dr.select(drawn, end, MAX_MAGNITUDE) for end in (across - support, -across - support)]
+        squares.append(counted * dr.fma(across, across, spread2))
+    lowest_ends, spreads = _reduced(
+        capacity, (dr.ReduceOp.Min, MAX_MAGNITUDE, ends), (dr.ReduceOp.Add, 0, squares)
+    )  # 4.32
     bounds = []
-    for low, high, square in extents:
-        lowest, highest = dr.min(low), dr.max(high)  # 4.32
+    for i, square in enumerate(spreads):
+        lowest, highest = lowest_ends[2 * i], -lowest_ends[2 * i + 1]
         if crop:
-            limit = REACH * dr.sqrt(dr.sum(square) * share)
+            limit = REACH * dr.sqrt(square * share)
             lowest, highest = dr.maximum(lowest, -limit), dr.minimum(highest, limit)
         some = lowest < highest
         bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
     return _camera(light, middle, bounds, size)
+
+
+def _reduced(capacity: int, *parts: tuple[dr.ReduceOp, float, list[Float]]) -> list[list[Float]]:
+    """Of each part (operation, its identity, rows [N]) its reduced rows, Floats of width 1. Rows lie one after another
+    in blocks of `capacity` numbers: a reduction is two launches, however many blocks there are."""
+    blocks = []
+    for _, identity, rows in parts:
+        numbers = dr.full(ad.Float, identity, len(rows) * capacity)
+        index = dr.arange(ad.UInt32, dr.width(rows[0]))
+        for i, row in enumerate(rows):
+            dr.scatter(numbers, row, index + i * capacity, mode=dr.ReduceMode.NoConflicts)
+        blocks.append(numbers)
+    reduced = [dr.block_reduce(op, numbers, capacity) for (op, *_), numbers in zip(parts, blocks, strict=True)]
+    return [[dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(dr.width(numbers))] for numbers in reduced]
 
 
 def _axis(light: Float, i: int) -> Array3f:

@@ -8,12 +8,13 @@ a second pass adds up each receiver's slots in order: the same input gives the s
 The adjoint is by hand: it replays the lists from their ends, as `blend.backward` does.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import cast
 
 import drjit as dr
 
-from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, NumberT, UInt32
+from spacesim.backend import ad, recorded, select
+from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
 from spacesim.splat.raster.bin import MakeLists, bin_splats
@@ -34,6 +35,7 @@ from spacesim.splat.raster.records import (
 from spacesim.splat.raster.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
 
 BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255
+TURN = {"cuda": 4, "llvm": 1}  #: events a turn of the loop: their numbers are read at once
 LEAST_BETA = 0.004  #: least end of a footprint: 99.6 % of its weight; the lists hold nothing below 1/255
 
 
@@ -85,46 +87,70 @@ def differentiable_occlusion(
         raise ValueError(f"bias: expected {count} numbers or one, found {dr.width(bias)}")
     if count == 0:
         return dr.zeros(ad.Float, 0)
-    bias = dr.detach(bias) + dr.zeros(ad.Float, count)
-    dr.make_opaque(bias)
-    rows, away = gaussians.shape_rows(), None if points is None else dr.detach(points) - dr.detach(gaussians.means)
-    opacity = ALPHA_MIN / beta_min  # of a receiver in the lists
-    prepared = _prepare(rows, away, camera, bias, antialiased, receives, opacity)
-    blockers, receivers, blocker_boxes, receiver_boxes = prepared
+    bias, points = dr.detach(bias), None if points is None else dr.detach(points)
+    if dr.width(bias) < count:
+        bias = bias + dr.zeros(ad.Float, count)
+        dr.make_opaque(bias)
+    rows, capacity = gaussians.shape_rows(), round_capacity(count)
+    events, boxes = make_events(
+        rows, points, camera, bias, antialiased, receives, beta_min, dr.opaque(ad.UInt32, count), capacity
+    )
+    return occlude(events, boxes, camera, count, make_lists)
+
+
+def occlude(events: Splats, boxes: Footprints, camera: Orthographic, count: int, make_lists: MakeLists) -> Float:
+    """Float [N]: occlusion of the N = `count` Gaussians of `make_events`, with gradients by the events where these have
+    some."""
     size = camera.width, camera.height
+    if not dr.grad_enabled(events):
+        return _Walk(events, boxes, size, count, make_lists).occlusion
     try:
-        return dr.custom(_Occlusion, blockers, receivers, blocker_boxes, receiver_boxes, size, make_lists)
+        return dr.custom(_Occlusion, events, boxes, size, count, make_lists)
     except RuntimeError as error:  # Dr.Jit wraps what is raised in there
         raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
 
 
 @recorded
-def _prepare(
+def make_events(
     rows: list[Float],
-    away: Array3f | None,
+    points: Array3f | None,
     camera: Orthographic,
     bias: Float,
     antialiased: bool,
     receives: Bool | None,
-    opacity: float,
-) -> tuple[Splats, Splats, Footprints, Footprints]:
-    """(splats of the blockers, of the receivers, footprints of both), [N], of the Gaussians with these `_rows`.
+    beta_min: float,
+    count: UInt32,
+    capacity: int,
+) -> tuple[Splats, Footprints]:
+    """Events [2 capacity] of `count` Gaussians with these `Gaussians.shape_rows`: receivers, then blockers; the rest
+    are invisible.
 
-    away: Array3f [3, N], metres, from the centres to where the receivers are, or None;  opacity: theirs, such that the
-    cut at ALPHA_MIN falls where their footprints end
+    Receivers come first, so that stable sorting puts them before blockers of the same key: nothing blocks itself, or
+    what is equally deep. points, bias, antialiased, receives, beta_min: see `occlusion_by_splatting`
+    capacity: `round_capacity` of `count`
     """
-    blockers, blocker_boxes = project(Gaussians.from_rows(rows), camera, antialiased)
-    means, shape, logit = ad.Array3f(rows[:3]), rows[3:10], rows[10]
-    blocker_boxes.order = _sortable(_depth(means, camera))
-    if away is not None:
-        means += away
-    logit = dr.detach(dr.select(dr.abs(logit) < MAX_MAGNITUDE, dr.log(ad.Float(opacity / (1 - opacity))), logit))
-    receivers, receiver_boxes = project(Gaussians.from_rows([*means, *shape, logit]), camera)
+    event = dr.arange(ad.UInt32, 2 * capacity)
+    is_receiver = event < capacity
+    index = dr.select(is_receiver, event, event - capacity)
+    live = index < count
+    receiving = live & is_receiver
+    x, y, z, *shape, logit = [dr.gather(ad.Float, row, index, live) for row in rows]
+    means = ad.Array3f(x, y, z)
+    if points is not None:
+        away = dr.gather(ad.Array3f, points, index, receiving) - dr.detach(means)
+        means += dr.select(receiving, away, ad.Array3f(0))
+    opacity = ALPHA_MIN / beta_min  # of a receiver: the cut at ALPHA_MIN falls where its footprint ends
+    ends = is_receiver & (dr.abs(dr.detach(logit)) < MAX_MAGNITUDE)
+    logit = dr.select(ends, dr.log(ad.Float(opacity / (1 - opacity))), logit)
+    events, boxes = project(
+        Gaussians.from_rows([*means, *shape, logit]), camera, ~is_receiver if antialiased else False
+    )
+    boxes.visible &= live
     if receives is not None:
-        receiver_boxes.visible &= receives
-    bias = dr.select((bias > 0) & (bias < MAX_MAGNITUDE), bias, 0)
-    receiver_boxes.order = _sortable(_depth(means, camera) - bias)
-    return blockers, receivers, blocker_boxes, receiver_boxes
+        boxes.visible &= ~is_receiver | dr.gather(ad.Bool, receives, index, receiving)
+    behind = dr.gather(ad.Float, bias, index, receiving)
+    boxes.order = _sortable(_depth(means, camera) - dr.select((behind > 0) & (behind < MAX_MAGNITUDE), behind, 0))
+    return events, boxes
 
 
 def _depth(means: Array3f, camera: Orthographic) -> Float:
@@ -134,56 +160,36 @@ def _depth(means: Array3f, camera: Orthographic) -> Float:
     return dr.select(depth == 0, 0, depth)
 
 
-@recorded
-def _events(
-    blockers: Splats,
-    receivers: Splats,
-    blocker_boxes: Footprints,
-    receiver_boxes: Footprints,
-    count: UInt32,
-    capacity: int,
-) -> tuple[Splats, Footprints]:
-    """Events [2 capacity]: receivers, then blockers, of `count` Gaussians; the rest are invisible.
-
-    Receivers come first, so that stable sorting puts them before blockers of the same key: nothing blocks itself, or
-    what is equally deep.
-    """
-    event = dr.arange(ad.UInt32, 2 * capacity)
-    receives = event < capacity
-    index = dr.select(receives, event, event - capacity)
-    live = index < count
-
-    def joined(of_receivers: NumberT, of_blockers: NumberT) -> NumberT:
-        receiver = dr.gather(type(of_receivers), of_receivers, index, live & receives)
-        return dr.select(receives, receiver, dr.gather(type(of_blockers), of_blockers, index, live & ~receives))
-
-    events = Splats(**{f.name: joined(getattr(receivers, f.name), getattr(blockers, f.name)) for f in fields(Splats)})
-    boxes = Footprints(
-        **{f.name: joined(getattr(receiver_boxes, f.name), getattr(blocker_boxes, f.name)) for f in fields(Footprints)}
-    )
-    boxes.visible &= live
-    return events, boxes
-
-
 @dataclass
-class _WalkResult:
-    """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]
+class _WalkTape:
+    """What `_replay` needs of `_walk`.
 
-    Tile-major, for the adjoint: transmittance and one past the last blocker of each pixel [T * threads * rows]; the
-    events' records in list order, see `records.BlendState`.
+    Tile-major: transmittance and one past the last blocker of each pixel [T * threads * rows]; the events' records in
+    list order, see `records.BlendState`.
     """
 
-    occlusion: Float
-    weight: Float
     transmittance: Float
     last: UInt32
     records: list[Float]
 
 
+@dataclass
+class _WalkResult:
+    """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]"""
+
+    occlusion: Float
+    weight: Float
+    tape: _WalkTape | None  #: where it was asked for
+
+
+Passed = tuple[list[Float], list[UInt32]]  #: transmittance and one past the last blocker of a thread's pixels
+
+
 @recorded
-def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], capacity: int) -> _WalkResult:
+def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int, adjoint: bool) -> _WalkResult:
     """What each receiver has lost; one thread holds a block of a tile's pixels."""
-    shape, pixels = lists.shape, lists.shape.pixels
+    shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
+    branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
     receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
     records = list_records(events, [receives], lists, round_capacity(2 * capacity))
     threads, thread = lists.tiles_x * lists.tiles_y * shape.threads, thread_pixels(lists)
@@ -195,40 +201,58 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[UInt32, UInt32], c
     def remaining(k: UInt32, _transmittance: object, _last: object) -> Bool:
         return k < end
 
-    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
-        record = load(records, k, lists.capacity)
-        powers = exponents(record, thread.x, thread.y, shape)
-        receiver = record[6] > 0
-        transmittance, last = list(transmittance), list(last)
+    def note(k: UInt32, powers: list[Float], transmittance: list[Float], last: list[UInt32], active: Bool) -> Passed:
+        """What receiver k has lost. All threads note theirs: to ask each whether it has anything to note costs more."""
         lost, weight = ad.Float(0), ad.Float(0)
         for p in range(pixels):
             alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
-            reached = powers[p] >= POWER_MIN
-            beta = dr.select(reached & inside[p], alpha, 0)
+            beta = dr.select(inside[p] & (powers[p] >= POWER_MIN), alpha, 0)
             lost, weight = dr.fma(beta, 1 - transmittance[p], lost), weight + beta
-            blocks = reached & ~receiver & (transmittance[p] > TRANSMITTANCE_MIN)
-            transmittance[p] = dr.select(blocks, transmittance[p] * (1 - alpha), transmittance[p])
-            last[p] = dr.select(blocks, k + 1, last[p])
-        slot = lists.sum_index(k)
-        noted = receiver & (weight > 0)
-        dr.scatter_reduce(dr.ReduceOp.Add, slots, ad.Array2f(lost, weight), slot, active=noted, mode=mode)
-        return k + 1, transmittance, last
+        sums = ad.Array2f(lost, weight)
+        dr.scatter_reduce(dr.ReduceOp.Add, slots, sums, lists.sum_index(k, active), active, mode)
+        return transmittance, last
+
+    def block(k: UInt32, powers: list[Float], transmittance: list[Float], last: list[UInt32], active: Bool) -> Passed:
+        """What blocker k lets through."""
+        transmittance, last = list(transmittance), list(last)
+        for p in range(pixels):
+            blocks = active & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
+            passed = transmittance[p] * (1 - dr.minimum(exp2(powers[p]), ALPHA_MAX))
+            transmittance[p] = dr.select(blocks, passed, transmittance[p])
+            if adjoint:
+                last[p] = dr.select(blocks, k + 1, last[p])
+        return transmittance, last
+
+    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
+        listed = [k + u < end if u else ad.Bool(True) for u in range(turn)]
+        loaded = [load(records, k + u, lists.capacity, listed[u]) for u in range(turn)]
+        for u, record in enumerate(loaded):
+            powers, receiver = exponents(record, thread.x, thread.y, shape), record[6] > 0
+            if branches:
+                state = k + u, powers, transmittance, last, listed[u]
+                transmittance, last = dr.if_stmt(state, receiver, note, block, mode="symbolic")
+            else:
+                note(k + u, powers, transmittance, last, receiver)
+                transmittance, last = block(k + u, powers, transmittance, last, listed[u] & ~receiver)
+        return k + turn, transmittance, last
 
     state = (
         dr.gather(ad.UInt32, lists.start, thread.tile),
         [ad.Float(1) for _ in range(pixels)],
-        [ad.UInt32(0) for _ in range(pixels)],
+        [ad.UInt32(0) for _ in range(pixels if adjoint else 0)],
     )
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
-    transmittance, last = store(transmittance, thread.place, threads), store(last, thread.place, threads)
-    dr.eval(slots, transmittance, last)
+    tape = None
+    if adjoint:
+        tape = _WalkTape(store(transmittance, thread.place, threads), store(last, thread.place, threads), records)
+    dr.eval(slots, tape)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
     occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
-    return _WalkResult(occlusion, weight, transmittance, last, records)
+    return _WalkResult(occlusion, weight, tape)
 
 
-def _inside(thread: ThreadPixels, offset: tuple[int, int], image_size: tuple[UInt32, UInt32]) -> Bool:
+def _inside(thread: ThreadPixels, offset: tuple[int, int], image_size: tuple[int, int]) -> Bool:
     """Is the thread's pixel at an offset from its first one of the picture's?"""
     return (thread.column + offset[0] < image_size[0]) & (thread.row + offset[1] < image_size[1])
 
@@ -252,7 +276,7 @@ def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
 
 @recorded
 def _replay(
-    events: Splats, walked: _WalkResult, lists: TileLists, image_size: tuple[UInt32, UInt32], gradient: Float
+    events: Splats, walked: _WalkResult, lists: TileLists, image_size: tuple[int, int], gradient: Float
 ) -> Splats:
     """Adjoint of `_walk`: from gradients of the occlusions [capacity] to gradients of the events.
 
@@ -260,10 +284,11 @@ def _replay(
     dL/d alpha_j = (sum over receivers i behind j of u_i beta_i T_i) / (1 - alpha_j).
     """
     shape, thread, offsets = lists.shape, thread_pixels(lists), thread_offsets(lists.shape)
-    inside = [_inside(thread, offset, image_size) for offset in offsets]
+    inside, tape = [_inside(thread, offset, image_size) for offset in offsets], walked.tape
+    assert tape is not None, "the way through the lists has kept nothing for its adjoint"
     places = [thread.place * shape.pixels + p for p in range(shape.pixels)]
-    transmittance = [dr.gather(ad.Float, walked.transmittance, place) for place in places]
-    last = [dr.gather(ad.UInt32, walked.last, place) for place in places]
+    transmittance = [dr.gather(ad.Float, tape.transmittance, place) for place in places]
+    last = [dr.gather(ad.UInt32, tape.last, place) for place in places]
     shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
     dr.eval(shares)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
@@ -275,7 +300,7 @@ def _replay(
 
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
-        record = load(walked.records, k, lists.capacity)
+        record = load(tape.records, k, lists.capacity)
         powers = exponents(record, thread.x, thread.y, shape)
         receiver = record[6] > 0
         event = dr.gather(ad.UInt32, lists.splat, k)
@@ -306,54 +331,54 @@ def _replay(
     return gradients
 
 
+class _Walk:
+    """Lists of the events of `count` Gaussians, and what was found on the way through them."""
+
+    def __init__(
+        self,
+        events: Splats,
+        boxes: Footprints,
+        size: tuple[int, int],
+        count: int,
+        make_lists: MakeLists,
+        adjoint: bool = False,
+    ) -> None:
+        self.events, self.size, self.count, self.capacity = events, size, count, round_capacity(count)
+        self.lists = make_lists(events, boxes, *size)
+        self.result: _WalkResult | None = None
+        if self.lists.capacity > 0:
+            self.result = _walk(events, self.lists, self.size, self.capacity, adjoint)
+
+    @property
+    def occlusion(self) -> Float:
+        """[N]"""
+        if self.result is None:
+            return dr.opaque(ad.Float, 0, self.count)
+        return dr.gather(ad.Float, self.result.occlusion, dr.arange(ad.UInt32, self.count))
+
+    def adjoint(self, grad_occlusion: Float) -> Splats:
+        """Gradients of the events from that of the occlusion [N]."""
+        if self.result is None:
+            zero = dr.opaque(ad.Float, 0, 2 * self.capacity)
+            return Splats(x=zero, y=zero, a=zero, b=zero, c=zero, opacity=zero, depth=zero)
+        receiver = dr.arange(ad.UInt32, self.capacity)
+        padded = dr.gather(ad.Float, grad_occlusion, receiver, receiver < dr.opaque(ad.UInt32, self.count))
+        return _replay(self.events, self.result, self.lists, self.size, padded)
+
+
 class _Occlusion(dr.CustomOp):
-    """From splats [N] to occlusions [N], as one node of Dr.Jit's graph. Differentiable in reverse mode."""
+    """From events [2 capacity] to occlusions [N], as one node of Dr.Jit's graph. Differentiable in reverse mode."""
 
     def eval(
-        self,
-        blockers: Splats,
-        receivers: Splats,
-        blocker_boxes: Footprints,
-        receiver_boxes: Footprints,
-        image_size: tuple[int, int],
-        make_lists: MakeLists,
+        self, events: Splats, boxes: Footprints, size: tuple[int, int], count: int, make_lists: MakeLists
     ) -> Float:
-        # Sizes in arrays: dr.freeze (1.5) takes one number for another where both have occurred among the arguments.
-        self.size = dr.opaque(ad.UInt32, image_size[0]), dr.opaque(ad.UInt32, image_size[1])
-        self.count = dr.width(blockers.x)
-        count = dr.opaque(ad.UInt32, self.count)
-        self.capacity = round_capacity(self.count)
-        self.events, boxes = _events(
-            dr.detach(blockers), dr.detach(receivers), blocker_boxes, receiver_boxes, count, self.capacity
-        )
-        self.lists = make_lists(self.events, boxes, *image_size)
-        if self.lists.capacity == 0:
-            return dr.opaque(ad.Float, 0, self.count)
-        self.walked = _walk(self.events, self.lists, self.size, self.capacity)
-        return dr.gather(ad.Float, self.walked.occlusion, dr.arange(ad.UInt32, self.count))
+        self.walk = _Walk(dr.detach(events), boxes, size, count, make_lists, adjoint=True)
+        return self.walk.occlusion
 
     def backward(self) -> None:
-        index, capacity = dr.arange(ad.UInt32, self.count), self.capacity
-        none = dr.opaque(ad.Float, 0, self.count)
-        zero = dr.opaque(ad.Float, 0, 2 * capacity)
-        grad_events = Splats(x=zero, y=zero, a=zero, b=zero, c=zero, opacity=zero, depth=zero)
-        if self.lists.capacity > 0:
-            receiver = dr.arange(ad.UInt32, capacity)
-            padded = dr.gather(ad.Float, self.grad_out(), receiver, receiver < dr.opaque(ad.UInt32, self.count))
-            grad_events = _replay(self.events, self.walked, self.lists, self.size, padded)
-        for name, first in (("receivers", 0), ("blockers", capacity)):
-            x, y, a, b, c, opacity = (
-                dr.gather(ad.Float, value, index + first)
-                for value in (
-                    grad_events.x,
-                    grad_events.y,
-                    grad_events.a,
-                    grad_events.b,
-                    grad_events.c,
-                    grad_events.opacity,
-                )
-            )
-            self.set_grad_in(name, Splats(x, y, a, b, c, opacity, none))
+        gradients = self.walk.adjoint(cast(Float, self.grad_out()))
+        gradients.depth = dr.opaque(ad.Float, 0, dr.width(gradients.x))
+        self.set_grad_in("events", gradients)
 
     def name(self) -> str:
         return "occlusion by splatting"

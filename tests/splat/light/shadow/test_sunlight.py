@@ -104,7 +104,7 @@ def test_degenerate_sets_have_sensible_cameras():
 
 def test_another_sun_replays_the_recording():
     def fit(rows, light):
-        return fit_camera(Gaussians.from_rows(rows), light, 32)
+        return fit_camera(Gaussians.from_rows(rows), light, 32, capacity=1024)
 
     gaussians = Gaussians.from_numpy(random_splats(64))
     replay, before = recorded(fit, limit=8), recordings()
@@ -112,6 +112,10 @@ def test_another_sun_replays_the_recording():
         again, alone = replay(gaussians.rows(), light_rows(sun)), fit_camera(gaussians, light_rows(sun), 32)
         assert np.array_equal(np.array(again.values), np.array(alone.values))
         assert (again.width, again.height) == (32, 32)
+    for count in (100, 1023):  # of the same capacity
+        others = Gaussians.from_numpy(random_splats(count))
+        again, alone = replay(others.rows(), light_rows([0, 1, 1])), fit_camera(others, light_rows([0, 1, 1]), 32)
+        assert np.array_equal(np.array(again.values), np.array(alone.values))
     assert recordings() == before + 1
 
 
