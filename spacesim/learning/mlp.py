@@ -16,6 +16,7 @@ from spacesim.learning.joined import Joined
 
 MAX_FEATURES, MAX_WIDTH, MAX_LAYERS = 1024, 4096, 32
 """Of a network: numbers a Gaussian, units of a layer, layers, far above any that pays."""
+WARP = 32  #: threads that sum up together on CUDA, of which columns are a multiple
 GROUPS = 8  #: of matrices that are summed up at the same time, on CUDA
 FEW = 4  #: rows of a matrix at which products by tiles are slow, on CUDA
 ALIGNED = 4  #: rows of matrices are a multiple of it
@@ -99,7 +100,7 @@ def forward(
         if i == 0:
             common = ad.TensorXf(weights[0], (rows, shape.shared))
             bias = bias + _product(common, ad.TensorXf(shared, (shape.shared, 1)))
-        if i > 0 and rows <= FEW and select() == "cuda":
+        if i > 0 and _is_few(rows):
             value = _product_of_few(weights[1 + 2 * i], rows, value) + bias
         else:
             value = _product(_matrix(shape, weights, i, first if i == 0 else 0), value) + bias
@@ -123,13 +124,17 @@ def backward(
     parts: list[Float] = []  # of each matrix, of the last layer first: gradients of the bias, of the weights
     grad_values = grad_output
     for i in reversed(range(shape.layers)):
-        parts.append(dr.block_reduce(dr.ReduceOp.Add, grad_values.array, grad_values.shape[2]))
+        rows, columns = shape.sizes[i]
+        parts.append(_sums_of_rows(grad_values))
         parts.append(_product(grad_values, tape[i], Bt=True).array)
-        grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
+        if i > 0 and _is_few(rows):
+            grad_values = _adjoint_of_few(weights[1 + 2 * i], columns, grad_values)
+        else:
+            grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
     sums = _over_matrices(parts, grad_output.shape[0])[::-1]
-    (rows, columns), grad_bias = shape.sizes[0], sums[1]
+    grad_bias = sums[1]
     sums[0] = _columns(sums[0], rows, tape[0].shape[1], columns)
     outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
     return [outer.array, *sums], grad_values
@@ -191,6 +196,34 @@ def _over_matrices(parts: list[Float], matrices: int) -> list[Float]:
     place = dr.arange(ad.UInt32, joined.size)
     of_groups = [dr.gather(ad.Float, totals, i * joined.size + place) for i in range(GROUPS)]
     return joined.split(sum(of_groups[1:], of_groups[0]))
+
+
+def _sums_of_rows(values: TensorXf) -> Float:
+    """Float [B * C] of a TensorXf [B, C, m]."""
+    m = values.shape[2]
+    if select() == "llvm":
+        return dr.block_reduce(dr.ReduceOp.Add, values.array, m)
+    warps = dr.zeros(ad.Float, dr.width(values.array) // WARP)  # where values are computed, not in a pass of its own
+    warp = dr.arange(ad.UInt32, dr.width(values.array)) // WARP
+    dr.scatter_reduce(dr.ReduceOp.Add, warps, values.array, warp, mode=dr.ReduceMode.Local)
+    dr.eval(values, warps)
+    return dr.block_reduce(dr.ReduceOp.Add, warps, m // WARP)
+
+
+def _is_few(rows: int) -> bool:
+    return rows <= FEW and select() == "cuda"
+
+
+def _adjoint_of_few(matrix: Float, columns: int, gradient: TensorXf) -> TensorXf:
+    """Adjoint of `_product_of_few` by the items, part of the kernel that reads it. gradient: TensorXf [B, rows, m]"""
+    matrices, rows, m = gradient.shape
+    entry = dr.arange(ad.UInt32, matrices * columns * m)
+    number, column, within = entry // (columns * m), (entry // m) % columns, entry % m
+    total = ad.Float(0)
+    for i in range(rows):
+        weight = dr.gather(ad.Float, matrix, i * columns + column)
+        total = dr.fma(weight, dr.gather(ad.Float, gradient.array, (number * rows + i) * m + within), total)
+    return ad.TensorXf(total, (matrices, columns, m))
 
 
 def _product_of_few(matrix: Float, rows: int, items: TensorXf) -> TensorXf:
