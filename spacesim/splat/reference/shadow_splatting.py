@@ -18,7 +18,7 @@ def occlusion_reference(
     gaussians: Mapping[str, np.ndarray],
     camera: OrthographicCamera,
     bias: np.ndarray,
-    beta_min: float = 0.05,
+    beta_min: float = 0.2,
     antialiased: bool = False,
     points: np.ndarray | None = None,
 ) -> np.ndarray:

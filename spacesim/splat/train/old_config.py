@@ -34,5 +34,8 @@ def _light(light: JsonDict) -> JsonDict:
         shadow = dict(shadow)
         mapping, gradients = shadow.pop("mapping", {}), shadow.pop("gradients", False)
         settings = mapping if method == "mapping" and isinstance(mapping, Mapping) else {"gradients": gradients}
-        light["shadow"] = {**shadow, "method": {"kind": method, **settings}}
+        light["shadow"] = shadow = {**shadow, "method": {"kind": method, **settings}}
+    if isinstance(shadow, Mapping) and isinstance(method := shadow.get("method"), Mapping):
+        ends = {"beta_min": 0.05} if method.get("kind") == "splatting" else {}
+        light["shadow"] = {**shadow, "method": {**ends, **method}}
     return light

@@ -30,9 +30,9 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "1129da887f7fec57",
-    "fast": "af4fd83ffaa22367",
-    "fine": "1477b1809b67d00d",
+    "demo": "bd4ecd2cca7ffc9f",
+    "fast": "78f42c48e2c8f55c",
+    "fine": "576289d903f81248",
     "thesis": "806759ef5cd0df0e",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
@@ -49,7 +49,7 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     if config.method == "vanilla":
         return with_settings(config, {"rates.sh_rest": 1.25e-4})
     if config.method == "baseline-park":
-        return config
+        return with_settings(config, {"light.shadow.method.beta_min": 0.05})
     features = 16 if config.preset == "demo" else 32
     settings = {"light.field.features": features, "rates.features_final": config.rates.features, "surfels": False}
     if config.method in ("shadow-map", "shadow-splat"):
@@ -60,7 +60,7 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
             settings["refinement.split_screen_size"] = 0.03
     if config.method == "shadow-splat":  # of these the one of `fine`
         settings |= {"refinement.split_screen": "all", "refinement.split_screen_size": 0.015}
-        settings |= {"light.shadow.bias": 5.0, "light.shadow.size": 1024}
+        settings |= {"light.shadow.bias": 5.0, "light.shadow.size": 1024, "light.shadow.method.beta_min": 0.05}
     return with_settings(config, settings)
 
 

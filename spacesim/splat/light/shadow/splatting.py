@@ -34,7 +34,7 @@ from spacesim.splat.raster.records import (
 )
 from spacesim.splat.raster.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
 
-BETA_MIN = 0.05  #: a receiver's footprint ends there: 95 % of its weight on 54 % of the area of a cut at 1/255
+BETA_MIN = 0.2  #: a receiver's footprint ends there: 80 % of its weight on 29 % of the area of a cut at 1/255
 TURN = {"cuda": 4, "llvm": 1}  #: events a turn of the loop: their numbers are read at once
 LEAST_BETA = 0.004  #: least end of a footprint: 99.6 % of its weight; the lists hold nothing below 1/255
 

@@ -70,7 +70,7 @@ def test_occlusion_matches_the_twin(count, size, antialiased):
     arrays, view = random_splats(count, seed=count), light(*size)
     bias = np.random.default_rng(count).uniform(0, 0.2, count)
     twin = occlusion_reference(arrays, view, bias, BETA_MIN, antialiased)
-    assert count < 60 or (twin.max() > 0.5 and (twin > 0).mean() > 0.5)
+    assert count < 60 or (twin.max() > 0.5 and (twin > 0).mean() > 0.4)
     np.testing.assert_allclose(occlusion(arrays, view, bias, antialiased), twin, atol=2e-6)
 
 
@@ -267,7 +267,7 @@ def test_recordings_serve_models_of_any_size():
     for count in (1000, 40, 1020, 7, 1, 961, 1000):
         arrays, view = random_splats(count, seed=count, degree=0), light(32, 24)
         ours, twin = occlusion(arrays, view, 0.01), occlusion_reference(arrays, view, np.full(count, 0.01))
-        np.testing.assert_allclose(ours, twin, atol=1e-4)
+        np.testing.assert_allclose(ours, twin, atol=2e-4)
 
 
 def test_recordings_tell_models_apart_whose_lists_are_equally_long():
