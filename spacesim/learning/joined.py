@@ -10,7 +10,8 @@ from spacesim.backend.arrays import Float, UInt32
 
 
 class Joined:
-    """Arrays of `sizes` numbers, one after another as one row [S]; may be part of a recording."""
+    """Arrays of `sizes` numbers, one after another as one row [S]. May be part of a recording, of which the sizes are
+    numbers: for others it must be another recording."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self.size = sum(sizes)

@@ -135,6 +135,7 @@ def backward(
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
     sums = _over_matrices(parts, grad_output.shape[0])[::-1]
     grad_bias = sums[1]
+    rows, columns = shape.sizes[0]
     sums[0] = _columns(sums[0], rows, tape[0].shape[1], columns)
     outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
     return [outer.array, *sums], grad_values
@@ -180,12 +181,12 @@ def _over_matrices(parts: list[Float], matrices: int) -> list[Float]:
         ones = dr.full(ad.TensorXf, 1, (1, matrices))
         rows = zip(parts, sizes, strict=True)
         return [_product(ones, ad.TensorXf(part, (matrices, size))).array for part, size in rows]
-    joined = Joined(sizes)
+    joined, end = Joined(sizes), dr.opaque(ad.UInt32, matrices)  # no number of a kernel's text
     entry = dr.arange(ad.UInt32, GROUPS * joined.size)
     place, group = entry % joined.size, entry // joined.size
 
     def has_more(k: UInt32, _total: Float) -> Bool:
-        return k < matrices
+        return k < end
 
     def add(k: UInt32, total: Float) -> tuple[UInt32, Float]:
         return k + GROUPS, total + joined.load(parts, place, k)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from spacesim.data.geometry import rotation_from_quaternion
+from spacesim.splat.light.shadow.splatting import BETA_MIN
 from spacesim.splat.raster.cameras import OrthographicCamera
 from spacesim.splat.reference.rasterizer import DILATION, PIXEL
 
@@ -18,7 +19,7 @@ def occlusion_reference(
     gaussians: Mapping[str, np.ndarray],
     camera: OrthographicCamera,
     bias: np.ndarray,
-    beta_min: float = 0.2,
+    beta_min: float = BETA_MIN,
     antialiased: bool = False,
     points: np.ndarray | None = None,
 ) -> np.ndarray:

@@ -183,9 +183,9 @@ class TrainConfig:
 
     @staticmethod
     def from_json(values: JsonMapping, name: str = "config.json") -> "TrainConfig":
-        """The inverse of `to_json`; missing keys have their defaults, and the key data, which a run's config.json has
-        besides, is passed over. name: of the file, for messages. Raises InputError for a key that is not known and for
-        a value that cannot be."""
+        """The inverse of `to_json`; missing keys have their defaults, or what `old_config` says of runs that had none,
+        and the key data, which a run's config.json has besides, is passed over. name: of the file, for messages. Raises
+        InputError for a key that is not known and for a value that cannot be."""
         settings = {key: value for key, value in values.items() if key != "data"}
         return _read(Document(name, in_this_layout(settings), {}), Rules())
 

@@ -10,8 +10,8 @@ _GONE = ("flatten_weight",)  #: fields that only training read
 
 
 def in_this_layout(values: JsonMapping) -> JsonDict:
-    """The fields of a TrainConfig, plain values; those in today's layout stay as they are, and so does what is neither:
-    the reader then says what is wrong."""
+    """The fields of a TrainConfig, plain values; those in today's layout stay as they are, but for what runs had that
+    name no `beta_min`, and so does what is neither: the reader then says what is wrong."""
     values = {name: value for name, value in values.items() if name not in _GONE}
     if isinstance(method := values.get("method"), str):
         values["method"] = ALIASES.get(method, method)

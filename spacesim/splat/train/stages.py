@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
@@ -159,14 +159,16 @@ def update_light(
     weights. factors: Float [3] or, with embeddings, [4]: two corrections, the networks' step size, the embeddings'"""
     count = dr.width(factors)
     numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in range(count)]
+    rates, corrections = [numbers[2]] * (len(weights) - count + 3) + numbers[3:], (numbers[0], numbers[1])
+    if select() == "llvm":
+        means = [mean(list(of_views)) for of_views in zip(*gradients, strict=True)]
+        return adam_step(weights, means, moments, rates, corrections)
     joined = Joined([dr.width(weight) for weight in weights])
-    rates = joined.repeat([numbers[2]] * (len(weights) - count + 3) + numbers[3:])
     gradient = mean([joined.load(of_view) for of_view in gradients])
     first, second = (joined.load(arrays) for arrays in moments)
-    corrections = numbers[0], numbers[1]
-    of_all = adam_step([joined.load(weights)], [gradient], ([first], [second]), [rates], corrections)
-    moved, first_moments, second_moments = (joined.split(row) for [row] in of_all)
-    return moved, first_moments, second_moments
+    rows, of_all = [joined.load(weights)], [joined.repeat(rates)]
+    moved, first_moments, second_moments = adam_step(rows, [gradient], ([first], [second]), of_all, corrections)
+    return joined.split(moved[0]), joined.split(first_moments[0]), joined.split(second_moments[0])
 
 
 def mean(values: list[Float]) -> Float:

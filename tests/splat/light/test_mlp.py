@@ -79,6 +79,14 @@ def passes(shape, weights, rows, shared, grad_rows, batch):
     return output, gradients, grad_items
 
 
+@pytest.fixture(params=["the backend's way", "CUDA's way"])
+def _ways(request, monkeypatch) -> None:
+    """That of CUDA gives the same on a CPU, where it is slower."""
+    if request.param == "CUDA's way":
+        monkeypatch.setattr(mlp, "select", lambda: "cuda")
+
+
+@pytest.mark.usefixtures("_ways")
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", SHAPES)
 def test_networks_and_their_adjoint_match_float64(name, count):
@@ -94,6 +102,7 @@ def test_networks_and_their_adjoint_match_float64(name, count):
         np.testing.assert_allclose(numbers(one), other, rtol=1e-4, atol=1e-6 * (100 + count))
 
 
+@pytest.mark.usefixtures("_ways")
 def test_recorded_passes_repeat_to_the_bit_and_serve_other_sizes():
     shape = SHAPES["filled up"]
     record = recorded(passes, limit=16)

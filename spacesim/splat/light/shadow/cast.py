@@ -19,6 +19,7 @@ from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.light.shadow.splatting import (
     BETA_MIN,
     LEAST_BETA,
+    Receivers,
     differentiable_occlusion,
     make_events,
     occlude,
@@ -121,7 +122,8 @@ def cast_shadows(
 ) -> Shadows:
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
     distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
-    rows, capacity, beta_min = gaussians.shape_rows(), round_capacity(gaussians.count), _beta_min(config)
+    rows = [dr.detach(row) for row in gaussians.shape_rows()]
+    capacity, beta_min = round_capacity(gaussians.count), _beta_min(config)
     of_view = rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity
     if isinstance(config.method, MappingConfig):
         view = _light_view(*of_view)
@@ -129,8 +131,6 @@ def cast_shadows(
         occlusion = occlusion_by_mapping(
             gaussians, view.camera, view.bias.bias, softness, config.method, view.points, make_lists=make_lists
         )
-    elif gaussians.count == 0:
-        view, occlusion = _light_view(*of_view), dr.zeros(ad.Float, 0)
     else:
         view, events, boxes = _light_events(*of_view, beta_min, dr.opaque(ad.UInt32, gaussians.count))
         occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
@@ -175,8 +175,8 @@ def cast_cross_shadows(
         )
         return dr.gather(ad.Float, occlusion, request.members)
 
-    occlude = by_mapping if isinstance(method, MappingConfig) else by_splatting
-    return occlusion_in_clusters(request.receivers, direction, config.size, least_scale, occlude, crop=config.crop)
+    by_method = by_mapping if isinstance(method, MappingConfig) else by_splatting
+    return occlusion_in_clusters(request.receivers, direction, config.size, least_scale, by_method, crop=config.crop)
 
 
 def _numbers(config: ShadowConfig) -> tuple[Float, Float]:
@@ -229,7 +229,8 @@ def _light_events(
     """`_light_view` and `make_events`. count: N"""
     view = _light_view(rows, light, strength, reach, size, crop, grazing, capacity)
     dr.eval(view)
-    return view, *make_events(rows, view.points, view.camera, view.bias.bias, False, None, beta_min, count, capacity)
+    receivers = Receivers(view.bias.bias, view.points, beta_min)
+    return view, *make_events(rows, receivers, view.camera, False, count, capacity)
 
 
 @recorded

@@ -22,6 +22,7 @@ from spacesim.splat.raster.tiles import round_capacity
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most
 MARGIN = 1.0  #: pixels left free along each border
+BLOCK = 1024  #: numbers that are reduced at once, of which capacities are a multiple
 UPRIGHT = 1e-10  #: radians off the vertical that are rounding of angles
 SUNS = 4096  #: whose axes and encodings are kept
 MIN_EXTENT_SHARE = 1e-3  #: least extent of the image, as a share of its larger one
@@ -109,16 +110,20 @@ def fit_camera(
 
 def _reduced(capacity: int, *parts: tuple[dr.ReduceOp, float, list[Float]]) -> list[list[Float]]:
     """Of each part (operation, its identity, rows [N]) its reduced rows, Floats of width 1. Rows lie one after another
-    in blocks of `capacity` numbers: a reduction is two launches, however many blocks there are."""
-    blocks = []
+    in blocks of `capacity` numbers: a reduction is two launches, however many rows there are."""
+    blocks, stride = [], dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text
     for _, identity, rows in parts:
         numbers = dr.full(ad.Float, identity, len(rows) * capacity)
         index = dr.arange(ad.UInt32, dr.width(rows[0]))
         for i, row in enumerate(rows):
-            dr.scatter(numbers, row, index + i * capacity, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(numbers, row, index + i * stride, mode=dr.ReduceMode.NoConflicts)
         blocks.append(numbers)
-    reduced = [dr.block_reduce(op, numbers, capacity) for (op, *_), numbers in zip(parts, blocks, strict=True)]
-    return [[dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(dr.width(numbers))] for numbers in reduced]
+    reduced = []
+    for (op, _, rows), numbers in zip(parts, blocks, strict=True):
+        of_blocks = dr.block_reduce(op, numbers, BLOCK)
+        of_rows = dr.block_reduce(op, of_blocks, capacity // BLOCK)
+        reduced.append([dr.gather(ad.Float, of_rows, ad.UInt32(i)) for i in range(len(rows))])
+    return reduced
 
 
 def _axis(light: Float, i: int) -> Array3f:

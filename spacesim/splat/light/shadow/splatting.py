@@ -91,10 +91,9 @@ def differentiable_occlusion(
     if dr.width(bias) < count:
         bias = bias + dr.zeros(ad.Float, count)
         dr.make_opaque(bias)
-    rows, capacity = gaussians.shape_rows(), round_capacity(count)
-    events, boxes = make_events(
-        rows, points, camera, bias, antialiased, receives, beta_min, dr.opaque(ad.UInt32, count), capacity
-    )
+    receivers = Receivers(bias, points, beta_min, receives)
+    live, capacity = dr.opaque(ad.UInt32, count), round_capacity(count)
+    events, boxes = make_events(gaussians.shape_rows(), receivers, camera, antialiased, live, capacity)
     return occlude(events, boxes, camera, count, make_lists)
 
 
@@ -110,47 +109,72 @@ def occlude(events: Splats, boxes: Footprints, camera: Orthographic, count: int,
         raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
 
 
+@dataclass
+class Receivers:
+    """N Gaussians as they receive light, see `occlusion_by_splatting`."""
+
+    bias: Float  #: [N] metres
+    points: Array3f | None  #: [3, N] metres
+    beta_min: float
+    receives: Bool | None = None  #: [N]
+
+
 @recorded
 def make_events(
-    rows: list[Float],
-    points: Array3f | None,
-    camera: Orthographic,
-    bias: Float,
-    antialiased: bool,
-    receives: Bool | None,
-    beta_min: float,
-    count: UInt32,
-    capacity: int,
+    rows: list[Float], receivers: Receivers, camera: Orthographic, antialiased: bool, count: UInt32, capacity: int
 ) -> tuple[Splats, Footprints]:
     """Events [2 capacity] of `count` Gaussians with these `Gaussians.shape_rows`: receivers, then blockers; the rest
     are invisible.
 
     Receivers come first, so that stable sorting puts them before blockers of the same key: nothing blocks itself, or
-    what is equally deep. points, bias, antialiased, receives, beta_min: see `occlusion_by_splatting`
-    capacity: `round_capacity` of `count`
+    what is equally deep. antialiased: see `occlusion_by_splatting`;  capacity: `round_capacity` of `count`
     """
-    event = dr.arange(ad.UInt32, 2 * capacity)
-    is_receiver = event < capacity
-    index = dr.select(is_receiver, event, event - capacity)
+    event, half = dr.arange(ad.UInt32, 2 * capacity), dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text
+    is_receiver = event < half
+    index = dr.select(is_receiver, event, event - half)
     live = index < count
     receiving = live & is_receiver
-    x, y, z, *shape, logit = [dr.gather(ad.Float, row, index, live) for row in rows]
+    of_events = dr.custom(_Twice, rows, index, live) if dr.grad_enabled(rows) else _gather_rows(rows, index, live)
+    x, y, z, *shape, logit = of_events
     means = ad.Array3f(x, y, z)
-    if points is not None:
-        away = dr.gather(ad.Array3f, points, index, receiving) - dr.detach(means)
+    if receivers.points is not None:
+        away = dr.gather(ad.Array3f, receivers.points, index, receiving) - dr.detach(means)
         means += dr.select(receiving, away, ad.Array3f(0))
-    opacity = ALPHA_MIN / beta_min  # of a receiver: the cut at ALPHA_MIN falls where its footprint ends
+    opacity = ALPHA_MIN / receivers.beta_min  # the cut at ALPHA_MIN falls where a receiver's footprint ends
     ends = is_receiver & (dr.abs(dr.detach(logit)) < MAX_MAGNITUDE)
     logit = dr.select(ends, dr.log(ad.Float(opacity / (1 - opacity))), logit)
     events, boxes = project(
         Gaussians.from_rows([*means, *shape, logit]), camera, ~is_receiver if antialiased else False
     )
     boxes.visible &= live
-    if receives is not None:
-        boxes.visible &= ~is_receiver | dr.gather(ad.Bool, receives, index, receiving)
-    behind = dr.gather(ad.Float, bias, index, receiving)
-    boxes.order = _sortable(_depth(means, camera) - dr.select((behind > 0) & (behind < MAX_MAGNITUDE), behind, 0))
+    if receivers.receives is not None:
+        boxes.visible &= ~is_receiver | dr.gather(ad.Bool, receivers.receives, index, receiving)
+    bias = dr.gather(ad.Float, receivers.bias, index, receiving)
+    boxes.order = _sortable(_depth(means, camera) - dr.select((bias > 0) & (bias < MAX_MAGNITUDE), bias, 0))
     return events, boxes
+
+
+def _gather_rows(rows: list[Float], index: UInt32, live: Bool) -> list[Float]:
+    return [dr.gather(ad.Float, row, index, live) for row in rows]
+
+
+class _Twice(dr.CustomOp):
+    """`_gather_rows` of events, whose receivers stand before their blockers, as one node of Dr.Jit's graph: the adjoint
+    of two gathers adds to what else there is in an order that nobody knows."""
+
+    def eval(self, rows: list[Float], index: UInt32, live: Bool) -> list[Float]:
+        self.count, self.capacity = dr.width(rows[0]), dr.width(index) // 2
+        return _gather_rows([dr.detach(row) for row in rows], index, live)
+
+    def backward(self) -> None:
+        index = dr.arange(ad.UInt32, self.count)
+        places = index, index + dr.opaque(ad.UInt32, self.capacity)
+        gradients = cast(list[Float], self.grad_out())
+        of_receivers, of_blockers = (_gather_rows(gradients, place, ad.Bool(True)) for place in places)
+        self.set_grad_in("rows", [a + b for a, b in zip(of_receivers, of_blockers, strict=True)])
+
+    def name(self) -> str:
+        return "rows of receivers and blockers"
 
 
 def _depth(means: Array3f, camera: Orthographic) -> Float:
@@ -164,7 +188,7 @@ def _depth(means: Array3f, camera: Orthographic) -> Float:
 class _WalkTape:
     """What `_replay` needs of `_walk`.
 
-    Tile-major: transmittance and one past the last blocker of each pixel [T * threads * rows]; the events' records in
+    Tile-major: transmittance and one past the last blocker of each pixel [T * pixels of a tile]; the events' records in
     list order, see `records.BlendState`.
     """
 

@@ -7,10 +7,14 @@ from scipy.spatial.transform import Rotation
 from splats import random_splats
 from walls import acne, screen_shadow, way
 
-from spacesim.backend import ad
+from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
+from spacesim.splat.light.shadow import splatting
 from spacesim.splat.light.shadow.bias import receiver_bias
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
+from spacesim.splat.light.shadow.light_camera import light_rows
+from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.light.shadow.splatting import BETA_MIN, LEAST_BETA, differentiable_occlusion, occlusion_by_splatting
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
@@ -64,6 +68,15 @@ def sheet(height: float, low: float, high: float, spacing: float = 0.05, opacity
     return placed(means, [0.7 * spacing, 0.7 * spacing, 1e-3], opacity)
 
 
+@pytest.fixture(params=["the backend's way", "CUDA's way"])
+def _ways(request, monkeypatch) -> None:
+    """That of CUDA gives the same on a CPU, where it is slower."""
+    if request.param == "CUDA's way":
+        monkeypatch.setattr(splatting, "select", lambda: "cuda")
+        monkeypatch.setattr(splatting, "_walk", recorded(splatting._walk.traced))
+
+
+@pytest.mark.usefixtures("_ways")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(("count", "size"), [(1, (40, 28)), (2, (40, 28)), (60, (16, 8)), (200, (33, 47))])
 def test_occlusion_matches_the_twin(count, size, antialiased):
@@ -334,6 +347,7 @@ def differences(arrays, view, bias, antialiased: bool, away: float, beta_min: fl
     return slopes
 
 
+@pytest.mark.usefixtures("_ways")
 @pytest.mark.parametrize(
     ("antialiased", "away", "beta_min"),
     [(False, 0.0, BETA_MIN), (True, 0.0, BETA_MIN), (False, 0.1, BETA_MIN), (False, 0.0, LEAST_BETA)],
@@ -353,3 +367,21 @@ def test_no_gradient_without_asking():
     for name in PARAMETERS:
         dr.enable_grad(getattr(gaussians, name))
     assert not dr.grad_enabled(occlusion_by_splatting(gaussians, Orthographic.of(light()), ad.Float(0)))
+    for method in (SplattingConfig(), MappingConfig()):
+        shadows = cast_shadows(gaussians, light_rows([0, 1, 1]), ShadowConfig(method, size=64), 4.0)
+        assert not dr.grad_enabled(shadows.occlusion)
+
+
+def test_gradients_repeat_to_the_bit_beside_those_of_another_term():
+    """Each Gaussian has one from its receiver, one from its blocker and one from elsewhere."""
+    count, gaussians = 20_000, Gaussians.from_numpy(random_splats(20_000, degree=0))
+    weight, view = upload(weights(count)), Orthographic.of(light(128, 96))
+    found = set()
+    for _ in range(8):
+        rows = [ad.Float(row) for row in gaussians.shape_rows()]
+        dr.enable_grad(rows)
+        occlusion = differentiable_occlusion(Gaussians.from_rows(rows), view, ad.Float(0.01))
+        others = sum((dr.sin(row) * weight for row in rows), ad.Float(0))
+        dr.backward(dr.sum(occlusion * weight) + dr.sum(others))
+        found.add(b"".join(np.array(dr.grad(row)).tobytes() for row in rows))
+    assert len(found) == 1
