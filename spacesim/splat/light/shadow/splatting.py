@@ -115,7 +115,7 @@ class Receivers:
 
     bias: Float  #: [N] metres
     points: Array3f | None  #: [3, N] metres
-    beta_min: float
+    beta_min: float  #: where their footprints end
     receives: Bool | None = None  #: [N]
 
 
