@@ -16,6 +16,7 @@ PIXELS = 1 << 22  #: of a picture, about, where faces are few enough
 LEAST, MOST = 3, 16  #: pixels of a side of a face's square
 BYTES = 100  #: of memory that a pixel takes while it is made, at most
 EVEN = 1 / 255  #: sRGB values this near to each other are one
+MODES = {"clamp": "nearest", "mirror": "reflect"}  #: of scipy's; what is neither repeats
 READ_AT_CORNERS = ("roughness", "metallic")  #: pictures that go with colours of vertices
 
 
@@ -119,23 +120,10 @@ class _Layout:
 
 def _read(picture: np.ndarray, uv: Array, wrap: str) -> Array:
     """Bilinear values of a picture [H, W] at texture coordinates [..., 2], v down."""
+    from scipy.ndimage import map_coordinates  # a quarter of a second, that most meshes need not wait
+
+    uv = np.nan_to_num(uv)
+    uv = np.clip(uv, 0, 1) if wrap == "clamp" else np.mod(uv, 2)  # the same place, and no number too large for it
     height, width = picture.shape
-    place = np.nan_to_num(uv) * (width, height) - 0.5
-    low = np.floor(place).astype(np.int64)
-    share = place - low
-    total = np.zeros(uv.shape[:-1])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            x, y = (_wrapped(low[..., i] + d, size, wrap) for i, d, size in ((0, dx, width), (1, dy, height)))
-            weight = np.abs(1 - dx - share[..., 0]) * np.abs(1 - dy - share[..., 1])
-            total += weight * picture[y, x]
-    return total
-
-
-def _wrapped(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
-    if wrap == "clamp":
-        return np.clip(index, 0, size - 1)
-    if wrap == "mirror":
-        index = index % (2 * size)
-        return np.where(index < size, index, 2 * size - 1 - index)
-    return index % size
+    places = np.moveaxis(uv * (width, height) - 0.5, -1, 0)[::-1]
+    return np.asarray(map_coordinates(picture, places, output=np.float64, order=1, mode=MODES.get(wrap, "grid-wrap")))
