@@ -6,7 +6,7 @@ from itertools import accumulate
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Bool, Float, UInt32
 
 
 class Joined:
@@ -22,8 +22,7 @@ class Joined:
         place = self._all() if place is None else place
         values = ad.Float(0)
         for array, (first, size) in zip(arrays, self._parts, strict=True):
-            own = (place >= first) & (place < first + size)
-            values += dr.gather(ad.Float, array, row * size + (place - first), own)
+            values += dr.gather(ad.Float, array, row * size + (place - first), _is_within(place, first, size))
         return values
 
     def repeat(self, numbers: Sequence[Float]) -> Float:
@@ -38,10 +37,13 @@ class Joined:
         place, arrays = self._all(), []
         for first, size in self._parts:
             array = dr.empty(ad.Float, size)
-            own = (place >= first) & (place < first + size)
-            dr.scatter(array, row, place - first, own, dr.ReduceMode.NoConflicts)
+            dr.scatter(array, row, place - first, _is_within(place, first, size), dr.ReduceMode.NoConflicts)
             arrays.append(array)
         return arrays
 
     def _all(self) -> UInt32:
         return dr.arange(ad.UInt32, self.size)
+
+
+def _is_within(place: UInt32, first: int, size: int) -> Bool:
+    return (place >= first) & (place < first + size)

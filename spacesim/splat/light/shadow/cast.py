@@ -124,15 +124,15 @@ def cast_shadows(
     distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
     capacity, beta_min = round_capacity(gaussians.count), _beta_min(config)
-    of_view = rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity
+    sunlit = _Sunlit(rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity)
     if isinstance(config.method, MappingConfig):
-        view = _light_view(*of_view)
+        view = _light_view(sunlit)
         softness = config.softness * distance
         occlusion = occlusion_by_mapping(
             gaussians, view.camera, view.bias.bias, softness, config.method, view.points, make_lists=make_lists
         )
     else:
-        view, events, boxes = _light_events(*of_view, beta_min, dr.opaque(ad.UInt32, gaussians.count))
+        view, events, boxes = _light_events(sunlit, beta_min, dr.opaque(ad.UInt32, gaussians.count))
         occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
     return Shadows(occlusion, rows, view.camera, view.bias, view.points, beta_min)
 
@@ -189,6 +189,20 @@ def _beta_min(config: ShadowConfig) -> float:
 
 
 @dataclass
+class _Sunlit:
+    """N Gaussians under a Sun."""
+
+    rows: list[Float]  #: `Gaussians.shape_rows`
+    light: Float  #: of `light_rows`
+    strength: Float  #: of the bias
+    reach: Float  #: of the grazing bias
+    size: int  #: of the light's picture
+    crop: bool
+    grazing: str
+    capacity: int  #: `round_capacity` of N
+
+
+@dataclass
 class _LightView:
     """How the Sun sees N Gaussians."""
 
@@ -198,39 +212,19 @@ class _LightView:
 
 
 @recorded
-def _light_view(
-    rows: list[Float],
-    light: Float,
-    strength: Float,
-    reach: Float,
-    size: int,
-    crop: bool,
-    grazing: str,
-    capacity: int,
-) -> _LightView:
-    """capacity: `round_capacity` of N"""
-    camera = fit_camera(Gaussians.from_rows(rows), light, size, crop, capacity)
-    return _LightView(camera, *_receivers(rows, camera, strength, reach, grazing))
+def _light_view(sunlit: _Sunlit) -> _LightView:
+    rows = sunlit.rows
+    camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.capacity)
+    return _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
 
 
 @recorded
-def _light_events(
-    rows: list[Float],
-    light: Float,
-    strength: Float,
-    reach: Float,
-    size: int,
-    crop: bool,
-    grazing: str,
-    capacity: int,
-    beta_min: float,
-    count: UInt32,
-) -> tuple[_LightView, Splats, Footprints]:
+def _light_events(sunlit: _Sunlit, beta_min: float, count: UInt32) -> tuple[_LightView, Splats, Footprints]:
     """`_light_view` and `make_events`. count: N"""
-    view = _light_view(rows, light, strength, reach, size, crop, grazing, capacity)
+    view = _light_view(sunlit)
     dr.eval(view)
     receivers = Receivers(view.bias.bias, view.points, beta_min)
-    return view, *make_events(rows, receivers, view.camera, False, count, capacity)
+    return view, *make_events(sunlit.rows, receivers, view.camera, False, count, sunlit.capacity)
 
 
 @recorded
