@@ -473,11 +473,12 @@ def test_numbers_are_read_without_synchronising():
     assert can_read_async()
     ad = backend.ad
     for turn in range(3):
-        squares = dr.square(dr.arange(ad.UInt64, 1000 + turn))
-        dr.eval(squares)
-        first, last = AsyncNumber(squares, 3), AsyncNumber(squares, 999 + turn)
-        del squares
-        assert (last.wait(), first.wait()) == ((999 + turn) ** 2, 9)
+        wide = (ad.UInt64(1) << 40) + dr.square(dr.arange(ad.UInt64, 1000 + turn))
+        squares = dr.square(dr.arange(ad.UInt32, 1000 + turn))
+        dr.eval(wide, squares)
+        first, last, short = AsyncNumber(wide, 3), AsyncNumber(wide, 999 + turn), AsyncNumber(squares, 31)
+        del wide, squares
+        assert (short.wait(), last.wait(), first.wait()) == (961, 2**40 + (999 + turn) ** 2, 2**40 + 9)
 
 
 @pytest.mark.gpu

@@ -13,10 +13,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from spacesim.backend.arrays import UInt64
+from spacesim.backend.arrays import UInt32, UInt64
 from spacesim.backend.selection import load_drjit, select
 
-BYTES = 8  #: of an entry
+_BYTES = 8  # of an entry, at most
 _LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
 _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
@@ -34,26 +34,29 @@ _SHARED = 1  # memory that the host reads and the device writes; on CUDA its pag
 
 
 class AsyncNumber:
-    """Entry `index` of an evaluated array UInt64 [N], read once with `wait`, by the thread that made it."""
+    """Entry `index` of an evaluated array UInt32 or UInt64 [N], read once with `wait`, by the thread that made it."""
 
-    def __init__(self, array: UInt64, index: int) -> None:
+    def __init__(self, array: UInt32 | UInt64, index: int) -> None:
         """Raises RuntimeError where `can_read_async` is false."""
         functions = _functions()
         if functions is None:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
-        backend = load_drjit().backend_v(array).value
+        dr = load_drjit()
+        backend = dr.backend_v(array).value
+        self._number: Any = c_uint64 if dr.itemsize_v(array) == _BYTES else c_uint32
+        size = ctypes.sizeof(self._number)
         free = _local.free
-        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, BYTES, _SHARED))
+        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, _BYTES, _SHARED))
         start = c_void_p()
         variable = functions["address"](array.index, ctypes.byref(start))
-        functions["copy"](backend, self._slot.address, (start.value or 0) + BYTES * index, BYTES)
+        functions["copy"](backend, self._slot.address, (start.value or 0) + size * index, size)
         functions["release"](variable)
         self._slot.record(functions)
 
     def wait(self) -> int:
         """The number. Waits for what was asked of the device before this was made, and for nothing else."""
         self._slot.event.wait()
-        number = c_uint64.from_address(self._slot.address).value
+        number = self._number.from_address(self._slot.address).value
         _local.free.append(self._slot)
         return number
 

@@ -9,6 +9,7 @@ in no list. How the lists are put in order depends on the backend, the order doe
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,8 @@ PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour a
 #: to 210 a pair, as the rounding of arrays has it
 TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
 #: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
+
+BELIEVED = 1  #: seconds for which memory that was free is taken to be
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Boxes:
     columns: UInt32  #: in a row
     count: UInt32  #: of all, 0 for what cannot be seen
     order: UInt32 | None  #: the splats in the order in which pairs are numbered, None: that of their indices
-    pair_ends: UInt64  #: pairs up to and including each splat, in that order
+    pair_ends: UInt32 | UInt64  #: pairs up to and including each splat, in that order
 
     def pairs(self, count: int) -> int:
         """How many they are, of `count` splats. Waits for the device."""
@@ -162,21 +165,46 @@ def check_memory(pairs: int, pixels: int, training: bool) -> None:
     most = MAX_PAIRS[select()]
     if pairs > most:
         raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {most:.3g} can be sorted")
-    free = free_memory(needed) if needed > 2**28 else None
+    if needed <= 2**28 or _found.holds(needed):
+        return
+    free = free_memory(needed)
     if free is not None and needed > free:
         raise WorkError(
             f"rasterizer: {pairs:.3g} pairs of tile and splat on {pixels:.3g} pixels need about {needed / 1e9:.3g} GB "
             f"of memory, {free / 1e9:.3g} GB are free"
         )
+    _found.note(needed)
+
+
+class _Found:
+    """Memory that was free a moment ago: to ask takes as long as some kernels."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def holds(self, needed: int) -> bool:
+        """Whether as many bytes were free less than `BELIEVED` seconds ago."""
+        return needed <= self._bytes and time.monotonic() < self._until
+
+    def note(self, needed: int) -> None:
+        """So many bytes are."""
+        self._bytes, self._until = needed, time.monotonic() + BELIEVED
+
+    def clear(self) -> None:
+        """Nothing is known."""
+        self._bytes, self._until = 0, 0.0
+
+
+_found = _Found()
 
 
 @recorded
 def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
     left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, grid)
-    wide = ad.UInt64(pairs)
-    dr.eval(left, top, columns, pairs, wide)
-    return Boxes(left, top, columns, pairs, None, _running_sum(wide))
+    numbers = _number_type(capacity, grid)(pairs)
+    dr.eval(left, top, columns, pairs, numbers)
+    return Boxes(left, top, columns, pairs, None, _running_sum(numbers))
 
 
 @recorded
@@ -188,7 +216,13 @@ def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, 
     key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
     dr.eval(left, top, columns, pairs, key)
     order = _stable_order(key, 32)
-    return Boxes(left, top, columns, pairs, order, _running_sum(ad.UInt64(dr.gather(ad.UInt32, pairs, order))))
+    numbers = _number_type(capacity, grid)(dr.gather(ad.UInt32, pairs, order))
+    return Boxes(left, top, columns, pairs, order, _running_sum(numbers))
+
+
+def _number_type(capacity: int, grid: Grid) -> type[UInt32] | type[UInt64]:
+    """Of integers that hold the number of pairs, whatever so many splats reach."""
+    return ad.UInt32 if capacity * grid.tiles < 2**32 else ad.UInt64
 
 
 def _boxes_in_tiles(
@@ -206,7 +240,7 @@ def _boxes_in_tiles(
     return x0, y0, dr.maximum(x1 - x0, 1), dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0)), live
 
 
-def _running_sum(values: UInt64) -> UInt64:
+def _running_sum(values: UInt32 | UInt64) -> UInt32 | UInt64:
     return dr.prefix_reduce(dr.ReduceOp.Add, values, exclusive=False)
 
 
@@ -220,17 +254,14 @@ def _count(
     grid: Grid,
 ) -> TileLists:
     """Lists that are ordered one by one."""
-    slot = dr.arange(ad.UInt32, capacity)
+    slot, ends = dr.arange(ad.UInt32, capacity), boxes.pair_ends
     fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
-    splat = segment_ids(
-        boxes.pair_ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity
-    )  # beyond the last pair: that one's splat
+    splat = segment_ids(ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity)  # beyond the last: its splat
     splat = dr.minimum(splat, splat_capacity - 1)  # where there are no pairs
-    before = ad.UInt32(dr.gather(ad.UInt64, boxes.pair_ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
+    before = ad.UInt32(dr.gather(type(ends), ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
     tile = _tile_of(splats, boxes, splat, slot - before, slot < total, grid)
     key = dr.gather(ad.UInt32, footprints.order, splat)
-    first_slot, slot_count = ad.UInt32(boxes.pair_ends) - boxes.count, dr.select(fits, boxes.count, 0)
-    dr.eval(first_slot, slot_count)
+    first_slot, slot_count = ad.UInt32(ends) - boxes.count, dr.select(fits, boxes.count, 0)
     splat, slot, start, end = ordered_lists(tile, key, splat, grid.tiles, capacity)
     return TileLists(splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape)
 
@@ -281,8 +312,9 @@ def _expand(
 def _pairs_that_fit(boxes: Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
     """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not. No number of a
     kernel's text, which would be compiled for each."""
-    pairs = dr.gather(ad.UInt64, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
-    fits = pairs <= dr.opaque(ad.UInt64, capacity)
+    number = type(boxes.pair_ends)
+    pairs = dr.gather(number, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
+    fits = pairs <= dr.opaque(number, capacity)
     return fits, ad.UInt32(dr.select(fits, pairs, 0))
 
 

@@ -13,11 +13,12 @@ from typing import cast
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array4u, Bool, UInt32, UInt64
+from spacesim.backend.arrays import Bool, UInt32, UInt64
 
 CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
 RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
-COMPARED = 2  #: entries compared in a turn of the loop
+WAYS = 4  #: into which a search divides what is left: fewer steps, which wait for one another, than by halves; 8 are slower
+COMPARED = 4  #: entries compared in a turn of the loop
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
 
@@ -25,13 +26,17 @@ def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
     segment_ends[i]; `count` for slots of no segment."""
     number, wide = type(segment_ends), type(segment_ends)(slot)
-    segment, step = ad.UInt32(0), 1 << (count.bit_length() - 1)
+    segment, step = ad.UInt32(0), 1
+    while WAYS * step <= count:
+        step *= WAYS
     while step:
-        probe = segment + step
-        within = probe <= count
-        reached = within & (dr.gather(number, segment_ends, probe - 1, within) <= wide)
-        segment = dr.select(reached, probe, segment)
-        step >>= 1
+        past = ad.UInt32(0)
+        for probe in (segment + way * step for way in range(1, WAYS)):
+            within = probe <= count
+            reached = within & (dr.gather(number, segment_ends, probe - 1, within) <= wide)
+            past += dr.select(reached, ad.UInt32(1), 0)
+        segment += past * step
+        step //= WAYS
     return segment
 
 
@@ -55,26 +60,26 @@ def ordered_lists(
     entry = dr.arange(ad.UInt32, capacity)
     listed = members < lists
     place += dr.gather(ad.UInt32, start, members, listed)
-    unordered = _packed([keys, numbers, entry, members], place, listed, capacity)
+    unordered = _packed(_joined(keys, numbers), _joined(members, entry), place, listed, capacity)
     dr.eval(unordered)
 
     live = entry < dr.gather(ad.UInt32, end, ad.UInt32(lists - 1))
-    entry_keys, first, last = _own(unordered, entry, live, start, end)
+    own, first, last = _own(unordered, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
-    rank = _count_before(unordered, entry_keys, chunk, dr.minimum(chunk + chunk_size, last))
-    in_chunks = _packed(list(entry_keys), chunk + rank, live, capacity)
+    rank = _count_before(unordered, own[0], chunk, dr.minimum(chunk + chunk_size, last))
+    in_chunks = _packed(*own, chunk + rank, live, capacity)
     dr.eval(in_chunks)
 
-    entry_keys, first, last = _own(in_chunks, entry, live, start, end)
+    own, first, last = _own(in_chunks, entry, live, start, end)
     chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
     run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
-    others = _search_others(in_chunks, entry_keys, chunk, run, dr.minimum(run + run_size, last), chunk_size)
+    others = _search_others(in_chunks, own[0], chunk, run, dr.minimum(run + run_size, last), chunk_size)
     place = dr.select(live, run + (entry - chunk) + others, entry)
     is_long = live & (last - first > run_size)
-    in_runs = _packed(list(entry_keys), place, is_long, capacity)
+    in_runs = _packed(*own, place, is_long, capacity)
     number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
-    dr.scatter(number, dr.select(live, entry_keys[1], 0), place)
-    dr.scatter(source, dr.select(live, entry_keys[2], 0), place)
+    dr.scatter(number, dr.select(live, ad.UInt32(own[0]), 0), place)
+    dr.scatter(source, dr.select(live, ad.UInt32(own[1]), 0), place)
     some_long = dr.zeros(ad.UInt32, 1)
     dr.scatter(some_long, ad.UInt32(1), ad.UInt32(0), is_long)
     dr.eval(number, source, in_runs, some_long)
@@ -83,7 +88,7 @@ def ordered_lists(
 
 
 def _merge_runs(
-    targets: tuple[UInt32, UInt32], entries: UInt32, some_long: UInt32, start: UInt32, end: UInt32, run_size: int
+    targets: tuple[UInt32, UInt32], entries: UInt64, some_long: UInt32, start: UInt32, end: UInt32, run_size: int
 ) -> None:
     """Write numbers and sources of the lists longer than a run, whose runs are in order, in the order of the whole
     list. One launch, which is over at once where there are none: some_long, of width 1, is 0."""
@@ -97,35 +102,41 @@ def _merge_runs(
         here = segment_ids(end, entry, lists)
         first, last = dr.gather(ad.UInt32, start, here), dr.gather(ad.UInt32, end, here)
         is_long = last - first > run_size
-        key = dr.gather(ad.Array4u, entries, entry, is_long)
+        own = dr.gather(ad.Array2u64, entries, entry, is_long)
         run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
-        others = _search_others(entries, key, run, first, dr.select(is_long, last, first), run_size)
-        for value, target in zip((key[1], key[2]), targets, strict=True):
-            dr.scatter(target, value, first + (entry - run) + others, is_long)
+        others = _search_others(entries, own[0], run, first, dr.select(is_long, last, first), run_size)
+        for value, target in zip(own, targets, strict=True):
+            dr.scatter(target, ad.UInt32(value), first + (entry - run) + others, is_long)
         return (entry + MERGE_THREADS,)
 
     dr.while_loop((dr.arange(ad.UInt32, MERGE_THREADS),), remaining, merge, mode="symbolic", label="merge runs")
     dr.eval(targets)
 
 
-def _packed(values: list[UInt32], index: UInt32, active: Bool | bool, size: int) -> UInt32:
-    """A flat array [4 size] in which the four `values` of an element stand at its index."""
-    target = dr.empty(ad.UInt32, 4 * size)
-    dr.scatter(target, ad.Array4u(values), index, active=active)
+def _joined(high: UInt32, low: UInt32) -> UInt64:
+    """Both in one number."""
+    return (ad.UInt64(high) << 32) | ad.UInt64(low)
+
+
+def _packed(key: UInt64, source: UInt64, index: UInt32, active: Bool | bool, size: int) -> UInt64:
+    """A flat array [2 size] in which an entry's two numbers stand at its index, see `_own`; and some more behind it,
+    so that a turn of `_count_before` may read beyond the end."""
+    target = dr.empty(ad.UInt64, 2 * (size + COMPARED))
+    dr.scatter(target, ad.Array2u64(key, source), index, active=active)
     return target
 
 
-def _own(entries: UInt32, entry: UInt32, live: Bool, start: UInt32, end: UInt32) -> tuple[Array4u, UInt32, UInt32]:
-    """(key, number, source, list) of an entry, and the half-open range of its list; an empty one if it is not live."""
-    key = dr.gather(ad.Array4u, entries, entry, live)
-    return key, dr.gather(ad.UInt32, start, key[3], live), dr.gather(ad.UInt32, end, key[3], live)
+def _own(
+    entries: UInt64, entry: UInt32, live: Bool, start: UInt32, end: UInt32
+) -> tuple[tuple[UInt64, UInt64], UInt32, UInt32]:
+    """((key and number, list and source) of an entry, where its list starts, and ends): an empty one if it is not
+    live."""
+    own = dr.gather(ad.Array2u64, entries, entry, live)
+    list_ = ad.UInt32(own[1] >> 32)
+    return (own[0], own[1]), dr.gather(ad.UInt32, start, list_, live), dr.gather(ad.UInt32, end, list_, live)
 
 
-def _before(other_key: Array4u, key: Array4u) -> Bool:
-    return (other_key[0] < key[0]) | ((other_key[0] == key[0]) & (other_key[1] < key[1]))
-
-
-def _count_before(entries: UInt32, key: Array4u, start: UInt32, end: UInt32) -> UInt32:
+def _count_before(entries: UInt64, key: UInt64, start: UInt32, end: UInt32) -> UInt32:
     """How many entries of [start, end) come before `key`."""
 
     def has_more(i: UInt32, _rank: UInt32) -> Bool:
@@ -133,16 +144,15 @@ def _count_before(entries: UInt32, key: Array4u, start: UInt32, end: UInt32) -> 
 
     def compare(i: UInt32, rank: UInt32) -> tuple[UInt32, UInt32]:
         for at in (i + u for u in range(COMPARED)):
-            within = at < end
-            other = dr.gather(ad.Array4u, entries, at, within)
-            rank = rank + dr.select(within & _before(other, key), ad.UInt32(1), ad.UInt32(0))
+            before = dr.gather(ad.UInt64, entries, 2 * at) < key
+            rank = rank + dr.select(before & (at < end), ad.UInt32(1), ad.UInt32(0))
         return i + COMPARED, rank
 
     _, rank = dr.while_loop((start, ad.UInt32(0)), has_more, compare, mode="symbolic", label="count before")
     return rank
 
 
-def _search_others(entries: UInt32, key: Array4u, chunk: UInt32, start: UInt32, end: UInt32, size: int) -> UInt32:
+def _search_others(entries: UInt64, key: UInt64, chunk: UInt32, start: UInt32, end: UInt32, size: int) -> UInt32:
     """How many entries of [start, end), which is in ordered chunks of `size`, come before `key`; but for the chunk that
     starts at `chunk`."""
 
@@ -155,8 +165,8 @@ def _search_others(entries: UInt32, key: Array4u, chunk: UInt32, start: UInt32, 
         while step:
             probe = low + step
             within = here & (probe <= stop)
-            other = dr.gather(ad.Array4u, entries, probe - 1, within)
-            low = dr.select(within & _before(other, key), probe, low)
+            before = dr.gather(ad.UInt64, entries, 2 * (probe - 1), within) < key
+            low = dr.select(within & before, probe, low)
             step >>= 1
         return at + size, rank + (low - at)
 

@@ -73,7 +73,6 @@ class AsyncTileLists:
         self.is_async = select() in backends and can_read_async()
         self._forecasts: dict[str, PairForecast] = {}
         self._pending: list[_PendingLists] = []
-        self._checked: set[tuple[int, int, bool]] = set()  # pairs, pixels, in training: there is memory for these
 
     def make(
         self,
@@ -99,17 +98,14 @@ class AsyncTileLists:
         return lists
 
     def _has_memory(self, capacity: int, pixels: int, training: bool) -> bool:
-        """Whether lists of a capacity fit into memory; checked once for lists of a size, as the step after keeps what
-        they took. Where they do not, the pairs that there are may. Of long ones the wait is short beside the work."""
-        size = capacity, pixels, training
+        """Whether lists of a capacity fit into memory; where they do not, the pairs that there are may. Of long ones
+        the wait is short beside the work."""
         if capacity > LONG:
             return False
-        if size not in self._checked:
-            try:
-                check_memory(capacity, pixels, training)
-            except WorkError:
-                return False
-            self._checked.add(size)
+        try:
+            check_memory(capacity, pixels, training)
+        except WorkError:
+            return False
         return True
 
     def all_fit(self) -> bool:
@@ -134,6 +130,5 @@ class AsyncTileLists:
 
     def after_refinement(self) -> None:
         """Other Gaussians are there, or other opacities."""
-        self._checked.clear()
         for forecast in self._forecasts.values():
             forecast.after_refinement()

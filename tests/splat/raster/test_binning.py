@@ -185,11 +185,23 @@ def test_lists_of_any_length_are_ordered(lengths, runs):
         np.testing.assert_array_equal(number[s:e], numbers[wanted])
 
 
-def test_segment_ids_of_slots():
-    counts = np.array([0, 3, 0, 0, 5, 1, 0])
-    ends = upload(np.cumsum(counts).astype(np.uint64), ad.UInt64)
-    found = np.array(segment_ids(ends, dr.arange(ad.UInt32, 11), len(counts)))
-    np.testing.assert_array_equal(found, [*np.repeat(np.arange(7), counts), 7, 7])
+@pytest.mark.parametrize("number", ["UInt32", "UInt64"])
+@pytest.mark.parametrize("segments", [1, 3, 4, 5, 7, 15, 16, 17, 64, 300, 1023])
+def test_segment_ids_of_slots(number, segments):
+    counts = np.random.default_rng(segments).choice([0, 0, 1, 3, 5, 90], segments)
+    ends = upload(np.cumsum(counts).astype(number.lower()), getattr(ad, number))
+    found = np.array(segment_ids(ends, dr.arange(ad.UInt32, int(counts.sum()) + 2), segments))
+    np.testing.assert_array_equal(found, [*np.repeat(np.arange(segments), counts), segments, segments])
+
+
+def test_pairs_are_numbered_in_few_bits_where_they_fit(way):
+    """In any case where all splats could reach all tiles."""
+    splats, footprints = projected(900, 70, 50)
+    for size, number in ((70, 50), ad.UInt32), ((16384, 16384), ad.UInt64):
+        grid = binning.Grid.of(*size)
+        boxes = binning.make_boxes(splats, footprints, dr.opaque(ad.UInt32, 900), tiles.round_capacity(900), grid)
+        assert type(boxes.pair_ends) is number
+        assert boxes.pairs(900) > 900
 
 
 @pytest.mark.parametrize(

@@ -323,6 +323,20 @@ def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
         Trainer(small_dataset, TrainConfig()).step()
 
 
+def test_memory_that_was_free_a_moment_ago_is_not_asked_for_again(monkeypatch):
+    asked, now = [], [100.0]
+    monkeypatch.setattr(binning, "free_memory", lambda needed: asked.append(needed) or 10**9)
+    monkeypatch.setattr(binning.time, "monotonic", lambda: now[0])
+    for pairs in (4 * 10**6, 4 * 10**6, 3 * 10**6, 5 * 10**6, 10**6):
+        binning.check_memory(pairs, 0, training=False)
+    assert asked == [8 * 10**8, 10**9]
+    with pytest.raises(WorkError, match=r"need about 1\.2 GB"):
+        binning.check_memory(6 * 10**6, 0, training=False)
+    now[0] += binning.BELIEVED
+    binning.check_memory(4 * 10**6, 0, training=False)
+    assert asked == [8 * 10**8, 10**9, 12 * 10**8, 8 * 10**8]
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1), (16, 8), (17, 9)])
 def test_pictures_of_few_pixels(size):
     arrays, view = random_splats(60, seed=4, degree=0), camera(*size)
@@ -394,13 +408,14 @@ def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
     buckets = []
     plain = rasterize.blend_lists
 
-    def spied(*arguments):
+    def spied(*arguments, **named):
         buckets.append(arguments[6] if len(arguments) > 6 else None)
-        return plain(*arguments)
+        return plain(*arguments, **named)
 
     for module in (rasterize, rendering):
         monkeypatch.setattr(module, "blend_lists", spied)
     monkeypatch.setattr(rendering, "_draw_boxes", rendering._draw_boxes.traced)
+    monkeypatch.setattr(rendering, "expected_capacity", lambda _: None)
     arrays, view = random_splats(30), camera()
     picture(arrays, view)
     gradients(arrays, view)
