@@ -33,6 +33,7 @@ from spacesim.splat.light.surroundings import HeldSurroundings, Surfaces, Surrou
 from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.picture_lists import computed
 
 log = logging.getLogger(__name__)
 
@@ -252,12 +253,18 @@ class LightModel:
         if dr.grad_enabled(read):
             return self._sunlight(gaussians, sun, embedding)
         if asked != last.asked or not _are_same(read, last.read):
-            sunlight = self._sunlight(gaussians, sun, embedding)
+            sunlight = computed(lambda make_lists: self._sunlight(gaussians, sun, embedding, make_lists))
             last = self._last_sunlight = _LastSunlight(_kept(read), asked, sunlight)
         return last.sunlight
 
-    def _sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None) -> Sunlight:
-        shadows = self.shadows(gaussians, sun)
+    def _sunlight(
+        self,
+        gaussians: Gaussians,
+        sun: np.ndarray | None,
+        embedding: np.ndarray | None,
+        make_lists: MakeLists = bin_splats,
+    ) -> Sunlight:
+        shadows = self.shadows(gaussians, sun, make_lists)
         batch = PaddedBatch.of(gaussians.count, still=True)
         of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun), of_picture)

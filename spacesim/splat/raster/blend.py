@@ -62,14 +62,15 @@ def blend_lists(
     height: int,
     capacity: int,
     bucket: int | None = None,
+    packed: list[Float] | None = None,
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for that by tiles, None where there is none"""
+    adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = TURN[select()]
     assert not bucket or bucket % turn == 0, "a bucket is some turns of the loop"
-    records = list_records(splats, features, lists, capacity)
+    records = list_records(splats, features, lists, capacity, packed)
     thread = thread_pixels(lists)
     start = dr.gather(ad.UInt32, lists.start, thread.tile)
     snapshots = _Checkpoints(lists, bucket, channels, thread.place, start) if bucket else None

@@ -49,18 +49,28 @@ def bucket_numbers(lists: TileLists, bucket: int) -> int:
     return lists.capacity // bucket + lists.tiles_x * lists.tiles_y + 1
 
 
-def list_records(splats: Splats, features: list[Float], lists: TileLists, capacity: int) -> list[Float]:
-    """The splats' numbers in list order, so that a tile reads memory in one run.
+def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[Float]:
+    """The splats' records, in arrays of `packet_sizes`: x, y, -a/2 log2 e, -b log2 e, -c/2 log2 e, log2 o, features.
 
-    Record: x, y, -a/2 log2 e, -b log2 e, -c/2 log2 e, log2 o, features; in arrays of `packet_sizes`.
-    capacity: length of the splats' arrays.
+    capacity: length of the splats' arrays
     """
-    if lists.capacity == 0:
-        return []
     numbers = [splats.x, splats.y, -0.5 * LOG2_E * splats.a, -LOG2_E * splats.b, -0.5 * LOG2_E * splats.c]
     numbers += [dr.log2(dr.maximum(splats.opacity, 1e-30)), *features]
     index = dr.arange(ad.UInt32, dr.width(splats.x))
-    packed = [store(values, index, capacity) for values in packets(numbers)]
+    return [store(values, index, capacity) for values in packets(numbers)]
+
+
+def list_records(
+    splats: Splats, features: list[Float], lists: TileLists, capacity: int, packed: list[Float] | None = None
+) -> list[Float]:
+    """The splats' records in list order, so that a tile reads memory in one run.
+
+    capacity: length of the splats' arrays;  packed: `pack_records`, where they are there
+    """
+    if lists.capacity == 0:
+        return []
+    if packed is None:
+        packed = pack_records(splats, features, capacity)
     dr.eval(packed)
     position = dr.arange(ad.UInt32, lists.capacity)
     records = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in packed]
@@ -71,8 +81,9 @@ def list_records(splats: Splats, features: list[Float], lists: TileLists, capaci
 def packet_sizes(numbers: int) -> list[int]:
     """How so many numbers of an entry are divided among arrays, in each of which those of an entry stand side by side:
     a thread reads or adds a packet at once. On LLVM one of eight numbers costs little more than one of four."""
+    rest = numbers % 4
     if select() == "cuda":
-        return [4] * -(-numbers // 4)
+        return [4] * (numbers // 4) + ([] if rest == 0 else [4] if rest == 3 else [rest])
     rest = numbers % 8
     return [8] * (numbers // 8) + ([] if rest == 0 else [2] if rest <= 2 else [4] if rest <= 4 else [8])
 
@@ -91,14 +102,17 @@ def store(values: list[NumberT], index: UInt32, size: int) -> NumberT:
     """A flat array [size * len(values)] in which `values` of an element stand at its index, by one packet scatter."""
     array_type = type(values[0])
     target = dr.empty(array_type, len(values) * size)
+    if len(values) == 1:
+        dr.scatter(target, values[0], index)
+        return target
     dr.scatter(target, (ad.ArrayXu if array_type is ad.UInt32 else ad.ArrayXf)(values), index)
     return target
 
 
-def packet(values: list[Float]) -> ArrayXf:
+def packet(values: list[Float]) -> ArrayXf | Float:
     """Values of an entry as one array, to be stored or added at once."""
     kinds = {2: ad.Array2f, 4: ad.Array4f}
-    return kinds.get(len(values), ad.ArrayXf)(values)
+    return values[0] if len(values) == 1 else kinds.get(len(values), ad.ArrayXf)(values)
 
 
 def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool = True) -> list[Float]:
@@ -109,7 +123,9 @@ def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool 
         size = packet_sizes(count)[-1]
         for part in range(count // size):
             place = index * (count // size) + part
-            if size == 8:
+            if size == 1:
+                values.append(dr.gather(ad.Float, array, place, active))
+            elif size == 8:
                 values += list(dr.gather(ad.ArrayXf, array, place, active, shape=(size, dr.width(index))))
             else:
                 values += list(dr.gather(ad.Array4f if size == 4 else ad.Array2f, array, place, active))

@@ -9,14 +9,16 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
 from spacesim.data.structure import checked
-from spacesim.splat.raster.bin import Boxes, Grid, bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.bin import Boxes, Grid, bin_splats, make_boxes, make_lists
 from spacesim.splat.raster.blend import blend_lists, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
+from spacesim.splat.raster.picture_lists import Kind, expected_capacity, observe
 from spacesim.splat.raster.project import Footprints, Splats, project
+from spacesim.splat.raster.records import pack_records
 from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals, unit
 from spacesim.splat.raster.tiles import TileLists, round_capacity
 
@@ -61,11 +63,12 @@ def render(
         return _empty_output(camera, outputs, None if features is None else len(feature_list))
 
     inputs = gaussians.rows(), camera, sh_degree, tuple(outputs), antialiased  # of `prepare`
-    more = {} if features is None else {"features": _clean_features(feature_list, gaussians.count)}
+    more = {} if features is None else {"features": _whole_features(feature_list, gaussians.count)}
     blended = sum(PLANES.get(name, 0) for name in outputs) + len(feature_list)
+    splats: Splats | None
     if blended > FEATURES_PER_PASS or dr.grad_enabled(inputs[0], camera.values, feature_list):
-        splats, footprints, groups = prepare(*inputs)
-        lists, planes = _draw_in_stages(splats, footprints, groups | more, camera)
+        splats, footprints, groups = _prepare_all(inputs, more)
+        lists, planes = _draw_in_stages(splats, footprints, groups, camera)
     else:
         splats, lists, planes = _draw(inputs, more, "median_depth" in outputs)
     return RenderOutput(
@@ -74,7 +77,7 @@ def render(
         depth=planes["depth"][0] if "depth" in planes else None,
         width=camera.width,
         height=camera.height,
-        median_depth=median_depth(splats, lists, camera) if lists and "median_depth" in outputs else None,
+        median_depth=median_depth(splats, lists, camera) if splats and lists and "median_depth" in outputs else None,
         normal=ad.Array3f(planes["normal"]) if "normal" in planes else None,
         features=planes.get("features"),
     )
@@ -92,53 +95,77 @@ def _draw_in_stages(
     splats: Splats, footprints: Footprints, groups: Planes, camera: Projection
 ) -> tuple[TileLists | None, Planes]:
     """(the tiles' lists, planes) of what is blended in any number of passes, differentiable."""
-    blended = blend(splats, footprints, [feature for group in groups.values() for feature in group], camera)
+    blended = blend(splats, footprints, _features(groups), camera)
     return blended.lists, _finish(blended.planes, blended.transmittance, groups)
 
 
-def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats, TileLists | None, Planes]:
-    """(splats; the tiles' lists, if they are wanted; planes) without gradients and in one pass: two recordings, between
-    which the host waits for the number of pairs. More passes in one would hold the memory of all. more: blended beside
-    the outputs"""
+def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats | None, TileLists | None, Planes]:
+    """(splats and the tiles' lists, if they are wanted; planes) without gradients and in one pass: one recording where
+    the number of pairs is expected, two, between which the host waits for it, where it is not. More passes in one would
+    hold the memory of all. more: blended beside the outputs"""
     rows, camera, *_ = inputs
     count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
-    most = round_capacity(count)
-    splats, footprints, groups, boxes = _prepare_boxes(inputs, dr.opaque(ad.UInt32, count), most, grid)
-    groups |= more
-    capacity = list_capacity(boxes.pairs(count), size[0] * size[1], few_sizes=True)
+    live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
+    kind = Kind(most, *size, few_sizes=True)
+    expected = expected_capacity(kind)
+    if expected is not None:
+        drawn, pair_ends = _draw_at_once(inputs, more, live, expected, most, grid, keeps_lists)
+        pairs = int(pair_ends[most - 1])
+        observe(kind, pairs)
+        if 0 < pairs <= expected:
+            return drawn
+        del drawn  # frees memory for the next
+    prepared = _prepare_boxes(inputs, more, live, most, grid)
+    capacity = observe(kind, prepared.boxes.pairs(count))
     if capacity == 0:
-        return splats, *_draw_in_stages(splats, footprints, groups, camera)
-    lists, planes = _draw_boxes(splats, footprints, boxes, groups, size, capacity, most, grid, keeps_lists)
-    return splats, lists, planes
+        return prepared.splats, *_draw_in_stages(prepared.splats, prepared.footprints, prepared.groups, camera)
+    return prepared.splats, *_draw_boxes(prepared, size, capacity, most, grid, keeps_lists)
+
+
+@dataclass
+class _Prepared:
+    """What is drawn of a picture's Gaussians, but for the lists."""
+
+    splats: Splats
+    footprints: Footprints
+    groups: Planes  #: to blend
+    records: list[Float]  #: `pack_records` of all that is blended
+    boxes: Boxes
+
+
+@recorded(elements=lambda arrays, inputs, *_: min(dr.width(arrays[0]), inputs[1].width * inputs[1].height))
+def _draw_at_once(
+    inputs: Inputs, more: Planes, count: UInt32, capacity: int, splat_capacity: int, grid: Grid, keeps_lists: bool
+) -> tuple[tuple[Splats | None, TileLists | None, Planes], UInt32 | UInt64]:
+    """(what `_draw` gives, with lists of `capacity`; up to where the splats' pairs are numbered)."""
+    size = inputs[1].width, inputs[1].height
+    prepared = _prepare_boxes(inputs, more, count, splat_capacity, grid)
+    drawn = _draw_boxes(prepared, size, capacity, splat_capacity, grid, keeps_lists)
+    return (prepared.splats if keeps_lists else None, *drawn), prepared.boxes.pair_ends
 
 
 @recorded
-def _prepare_boxes(
-    inputs: Inputs, count: UInt32, capacity: int, grid: Grid
-) -> tuple[Splats, Footprints, Planes, Boxes]:
-    """`prepare`, and the boxes of the `count` splats [capacity]."""
-    splats, footprints, groups = prepare(*inputs)
-    dr.eval(splats, footprints, groups)
-    return splats, footprints, groups, make_boxes(splats, footprints, count, capacity, grid)
+def _prepare_boxes(inputs: Inputs, more: Planes, count: UInt32, capacity: int, grid: Grid) -> _Prepared:
+    """Of `count` splats [capacity]. more: blended beside the outputs"""
+    splats, footprints, groups = _prepare_all(inputs, more)
+    records = pack_records(splats, _features(groups), capacity)
+    dr.eval(splats, footprints, groups, records)
+    return _Prepared(splats, footprints, groups, records, make_boxes(splats, footprints, count, capacity, grid))
 
 
-@recorded(elements=lambda _, splats, footprints, boxes, groups, size, *_rest: size[0] * size[1])
+@recorded(elements=lambda _, _prepared, size, *_rest: size[0] * size[1])
 def _draw_boxes(
-    splats: Splats,
-    footprints: Footprints,
-    boxes: Boxes,
-    groups: Planes,
-    size: tuple[int, int],
-    capacity: int,
-    splat_capacity: int,
-    grid: Grid,
-    keeps_lists: bool,
+    prepared: _Prepared, size: tuple[int, int], capacity: int, splat_capacity: int, grid: Grid, keeps_lists: bool
 ) -> tuple[TileLists | None, Planes]:
     """(the lists, of `capacity`, if they are wanted; planes)."""
-    lists = make_lists(splats, footprints, boxes, capacity, splat_capacity, grid)
-    features = [feature for group in groups.values() for feature in group]
-    blended = blend_lists(splats, features, lists, *size, splat_capacity)
+    splats, groups = prepared.splats, prepared.groups
+    lists = make_lists(splats, prepared.footprints, prepared.boxes, capacity, splat_capacity, grid)
+    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, packed=prepared.records)
     return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, groups)
+
+
+def _features(groups: Planes) -> list[Float]:
+    return [feature for group in groups.values() for feature in group]
 
 
 @recorded
@@ -158,16 +185,24 @@ def prepare(
     return splats, footprints, groups
 
 
-def _clean_features(features: list[Float], count: int) -> list[Float]:
-    """The user's features as Floats [count], finite."""
-    features = [feature if dr.width(feature) == count else feature + dr.zeros(ad.Float, count) for feature in features]
-    alike = len({feature.index for feature in features}) < len(features)  # no array may stand twice in a recorded call
-    return (_clean.traced if alike else _clean)(features)
-
-
 @recorded
-def _clean(features: list[Float]) -> list[Float]:
-    return [_finite(feature) for feature in features]
+def _prepare_all(inputs: Inputs, more: Planes) -> tuple[Splats, Footprints, Planes]:
+    """`prepare`, and the user's features, finite."""
+    splats, footprints, groups = prepare(*inputs)
+    return splats, footprints, groups | {name: [_finite(one) for one in group] for name, group in more.items()}
+
+
+def _whole_features(features: list[Float], count: int) -> list[Float]:
+    """The user's features as Floats [count], each another array, as recorded calls take them."""
+    seen: set[int] = set()
+    whole = []
+    for feature in features:
+        if dr.width(feature) != count or feature.index in seen:
+            feature = feature + dr.zeros(ad.Float, count)
+            dr.make_opaque(feature)
+        seen.add(feature.index)
+        whole.append(feature)
+    return whole
 
 
 def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:

@@ -14,7 +14,13 @@ from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.bias import Bias, grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.light.shadow.light_camera import fit_camera
-from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
+from spacesim.splat.light.shadow.mapping import (
+    MappingConfig,
+    MapReceivers,
+    occlusion_by_mapping,
+    occlusion_in_picture,
+    project_casters,
+)
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.light.shadow.splatting import (
     BETA_MIN,
@@ -126,11 +132,9 @@ def cast_shadows(
     capacity, beta_min = round_capacity(gaussians.count), _beta_min(config)
     sunlit = _Sunlit(rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity)
     if isinstance(config.method, MappingConfig):
-        view = _light_view(sunlit)
-        softness = config.softness * distance
-        occlusion = occlusion_by_mapping(
-            gaussians, view.camera, view.bias.bias, softness, config.method, view.points, make_lists=make_lists
-        )
+        view, splats, boxes = _light_splats(sunlit, config.method.antialiased)
+        receivers = MapReceivers.of(rows, view.points, view.bias.bias, config.softness * distance)
+        occlusion = occlusion_in_picture(receivers, (splats, boxes), view.camera, config.method, [], make_lists)
     else:
         view, events, boxes = _light_events(sunlit, beta_min, dr.opaque(ad.UInt32, gaussians.count))
         occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
@@ -216,6 +220,13 @@ def _light_view(sunlit: _Sunlit) -> _LightView:
     rows = sunlit.rows
     camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.capacity)
     return _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
+
+
+@recorded
+def _light_splats(sunlit: _Sunlit, antialiased: bool) -> tuple[_LightView, Splats, Footprints]:
+    """`_light_view` and `project_casters`."""
+    view = _light_view(sunlit)
+    return view, *project_casters(sunlit.rows, view.camera, antialiased)
 
 
 @recorded

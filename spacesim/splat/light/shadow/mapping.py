@@ -107,29 +107,48 @@ def occlusion_by_mapping(
         return dr.zeros(ad.Float, 0)
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
     casting = [] if casters is None else [dr.detach(row) for row in casters.shape_rows()]
-    splats, footprints = _prepare(casting or rows, camera, config.antialiased)
-    lists = make_lists(splats, footprints, camera.width, camera.height)
-    if lists.capacity == 0:
-        return dr.opaque(ad.Float, 0, gaussians.count)
-    points, bias = None if points is None else dr.detach(points), dr.detach(bias)
-    test = _Receivers(rows, points, bias, dr.opaque(ad.Float, max(softness, 1e-20)))
-    surfaces = casting if config.filter == "median" else []  # other filters read the splats alone
-    return _tested(test, surfaces, splats, lists, camera, config, round_capacity(dr.width(splats.x)))
+    drawn = project_casters(casting or rows, camera, config.antialiased)
+    receivers = MapReceivers.of(rows, points, bias, softness)
+    return occlusion_in_picture(receivers, drawn, camera, config, casting, make_lists)
 
 
 @dataclass
-class _Receivers:
-    """Receivers."""
+class MapReceivers:
+    """N Gaussians that are tested in a shadow map."""
 
-    rows: list[Float]  #: the shape of the Gaussians
-    points: Array3f | None  #: where they are tested, None for their centres; bias, Float [N], and softness, metres
-    bias: Float
-    softness: Float
+    rows: list[Float]  #: their shapes, detached
+    points: Array3f | None  #: where they are tested, None for their centres
+    bias: Float  #: [N], metres
+    softness: Float  #: metres
+
+    @staticmethod
+    def of(rows: list[Float], points: Array3f | None, bias: Float, softness: float) -> "MapReceivers":
+        """See `occlusion_by_mapping`."""
+        points, bias = None if points is None else dr.detach(points), dr.detach(bias)
+        return MapReceivers(rows, points, bias, dr.opaque(ad.Float, max(softness, 1e-20)))
+
+
+def occlusion_in_picture(
+    receivers: MapReceivers,
+    drawn: tuple[Splats, Footprints],
+    camera: Orthographic,
+    config: MappingConfig,
+    casting: list[Float],
+    make_lists: MakeLists,
+) -> Float:
+    """`occlusion_by_mapping` by what `project_casters` has drawn. casting: rows of the casters, none: those of the
+    receivers"""
+    splats, footprints = drawn
+    lists = make_lists(splats, footprints, camera.width, camera.height)
+    if lists.capacity == 0:
+        return dr.opaque(ad.Float, 0, dr.width(receivers.rows[0]))
+    surfaces = casting if config.filter == "median" else []  # other filters read the splats alone
+    return _tested(receivers, surfaces, splats, lists, camera, config, round_capacity(dr.width(splats.x)))
 
 
 @recorded
 def _tested(
-    test: _Receivers,
+    test: MapReceivers,
     casting: list[Float],
     splats: Splats,
     lists: TileLists,
@@ -172,11 +191,12 @@ def _median_shadow_map(
 
 
 @recorded
-def _prepare(rows: list[Float], camera: Orthographic, antialiased: bool) -> tuple[Splats, Footprints]:
+def project_casters(rows: list[Float], camera: Orthographic, antialiased: bool) -> tuple[Splats, Footprints]:
+    """What the Sun's picture shows of Gaussians with these `shape_rows`."""
     return project(Gaussians.from_rows(rows), camera, antialiased)
 
 
-def _look_up(test: _Receivers, light: ShadowMap, camera: Orthographic, config: MappingConfig) -> Float:
+def _look_up(test: MapReceivers, light: ShadowMap, camera: Orthographic, config: MappingConfig) -> Float:
     gaussians = Gaussians.from_rows(test.rows)
     visible = drawable_mask(gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities)
     center = camera.transform(gaussians.means if test.points is None else test.points)
@@ -223,7 +243,7 @@ class SunView:
         rows = [dr.detach(row) for row in casters.shape_rows()]
         if casters.count == 0:
             return None
-        splats, footprints = _prepare(rows, camera, config.antialiased)
+        splats, footprints = project_casters(rows, camera, config.antialiased)
         lists = bin_splats(splats, footprints, camera.width, camera.height)
         if lists.capacity == 0:
             return None
