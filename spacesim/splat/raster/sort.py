@@ -17,7 +17,7 @@ from spacesim.backend.arrays import Bool, UInt32, UInt64
 
 CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
 RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
-WAYS = 4  #: into which a search divides what is left: fewer steps, which wait for one another, than by halves; 8 are slower
+WAYS = 4  #: parts of what is left, of which a search takes one: fewer steps than by halves; 8 are slower
 COMPARED = 4  #: entries compared in a turn of the loop
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
 
