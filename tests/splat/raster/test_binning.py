@@ -139,7 +139,7 @@ def test_recordings_serve_other_numbers_of_splats_and_pairs(way):
 
 def test_no_visible_splats_give_empty_lists(way):
     splats, footprints = projected(50, 32, 32)
-    hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 50))
+    hidden = dataclasses.replace(footprints, visible=dr.opaque(ad.Bool, False, 50))
     lists = binning.bin_splats(splats, hidden, 32, 32)
     assert lists.pairs == 0
     assert lists.capacity == 0
@@ -158,7 +158,7 @@ def test_lists_made_without_a_wait_are_the_same_where_they_fit(way, spare):
         lists, number = binning.bin_async(splats, footprints, 70, 50, less)
         assert number.wait() == pairs
         assert sum(map(len, listed(lists))) == np.array(lists.slot_count).sum() == 0
-    hidden = dataclasses.replace(footprints, visible=dr.zeros(ad.Bool, 900))
+    hidden = dataclasses.replace(footprints, visible=dr.opaque(ad.Bool, False, 900))
     lists, number = binning.bin_async(splats, hidden, 70, 50, pairs)
     assert number.wait() == sum(map(len, listed(lists))) == 0
 
