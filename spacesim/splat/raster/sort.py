@@ -3,11 +3,13 @@ itself.
 
 An entry's place among those of its list is taken by an atomic increment, so lists are unordered; then each entry
 counts how many of its list come before it. Key and number distinguish any two entries of a list: where one ends up does
-not depend on the order of the input. A list is ordered in chunks of `CHUNK` entries by comparing each with each;
-an entry then looks for its place in the other chunks of its run of `RUN` by bisection, and, in longer lists, in the
-other runs. Of a list of L that takes CHUNK + RUN / CHUNK log2 CHUNK + L / RUN log2 RUN steps an entry.
+not depend on the order of the input. A list is ordered in runs: in the shortest each entry is compared with each; from
+runs of one size to those of the next an entry looks for its place in the others by bisection, and, in lists longer than
+the longest run, in all other runs. With runs of 64 and 4096 a list of L takes 64 + 64 log2 64 + L / 4096 log2 4096
+steps an entry.
 """
 
+import itertools
 from typing import cast
 
 import drjit as dr
@@ -15,11 +17,13 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, UInt32, UInt64
 
-CHUNK = 64  #: entries that are compared each with each, a power of two; 128 and 256 took longer on an H100
-RUN = 4096  #: entries within which chunks are searched, a power of two: lists of pictures are shorter
+SIZES = 64, 4096  #: entries, powers of two: so many are compared each with each (with 32, 128 or 256 an H100 takes
+#: longer); of these as many as are searched in one pass, the lists of pictures being short
+SIZES_OF_LONG = 64, 512, 4096, 32768, 262144  #: passes that take less where lists are long
+LONG = 512  #: entries a list for which there is room, from which on they may be
 WAYS = 4  #: parts of what is left, of which a search takes one: fewer steps than by halves; 8 are slower
 COMPARED = 4  #: entries compared in a turn of the loop
-MERGE_THREADS = 2**16  #: that share the entries of lists beyond RUN: as many as fill a large device
+MERGE_THREADS = 2**16  #: that share the entries of lists beyond the longest run: as many as fill a large device
 
 
 def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int) -> UInt32:
@@ -41,15 +45,21 @@ def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int
 
 
 def ordered_lists(
-    members: UInt32, keys: UInt32, numbers: UInt32, lists: int, capacity: int, runs: tuple[int, int] = (CHUNK, RUN)
+    members: UInt32,
+    keys: UInt32,
+    numbers: UInt32,
+    lists: int,
+    capacity: int,
+    sizes: tuple[int, ...] | None = None,
 ) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     """Entries [P] = [capacity] in lists, each ordered by key, then number: (number, entry) [P] one list after another,
     and where each list starts and ends, [lists]. Entries whose list is `lists` are in none; what stands behind the
     last list has no meaning. UInt32 all; no two entries of a list may have one key and number. Not differentiable.
 
-    runs: (CHUNK, RUN)
+    sizes: of the runs that are made one from another, by default `SIZES`, `SIZES_OF_LONG` for lists that may be long
     """
-    chunk_size, run_size = runs
+    if sizes is None:
+        sizes = SIZES_OF_LONG if capacity > LONG * lists else SIZES
     lengths = dr.zeros(ad.UInt32, lists)
     place = cast(UInt32, dr.scatter_inc(lengths, members, members < lists))
     dr.eval(place, lengths, members, numbers, keys)
@@ -60,22 +70,26 @@ def ordered_lists(
     entry = dr.arange(ad.UInt32, capacity)
     listed = members < lists
     place += dr.gather(ad.UInt32, start, members, listed)
-    unordered = _packed(_joined(keys, numbers), _joined(members, entry), place, listed, capacity)
-    dr.eval(unordered)
+    entries = _packed(_joined(keys, numbers), _joined(members, entry), place, listed, capacity)
+    dr.eval(entries)
 
     live = entry < dr.gather(ad.UInt32, end, ad.UInt32(lists - 1))
-    own, first, last = _own(unordered, entry, live, start, end)
-    chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
-    rank = _count_before(unordered, own[0], chunk, dr.minimum(chunk + chunk_size, last))
-    in_chunks = _packed(*own, chunk + rank, live, capacity)
-    dr.eval(in_chunks)
+    own, first, last = _own(entries, entry, live, start, end)
+    chunk = _start_of_run(entry, first, sizes[0])
+    rank = _count_before(entries, own[0], chunk, dr.minimum(chunk + sizes[0], last))
+    entries = _packed(*own, chunk + rank, live, capacity)
+    dr.eval(entries)
 
-    own, first, last = _own(in_chunks, entry, live, start, end)
-    chunk = first + ((entry - first) & ~ad.UInt32(chunk_size - 1))
-    run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
-    others = _search_others(in_chunks, own[0], chunk, run, dr.minimum(run + run_size, last), chunk_size)
-    place = dr.select(live, run + (entry - chunk) + others, entry)
-    is_long = live & (last - first > run_size)
+    for size, larger in itertools.pairwise(sizes):
+        own, first, last = _own(entries, entry, live, start, end)
+        chunk, run = _start_of_run(entry, first, size), _start_of_run(entry, first, larger)
+        others = _search_others(entries, own[0], chunk, run, dr.minimum(run + larger, last), size)
+        place = dr.select(live, run + (entry - chunk) + others, entry)
+        if larger == sizes[-1]:
+            break
+        entries = _packed(*own, place, live, capacity)
+        dr.eval(entries)
+    is_long = live & (last - first > sizes[-1])
     in_runs = _packed(*own, place, is_long, capacity)
     number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
     dr.scatter(number, dr.select(live, ad.UInt32(own[0]), 0), place)
@@ -83,8 +97,13 @@ def ordered_lists(
     some_long = dr.zeros(ad.UInt32, 1)
     dr.scatter(some_long, ad.UInt32(1), ad.UInt32(0), is_long)
     dr.eval(number, source, in_runs, some_long)
-    _merge_runs((number, source), in_runs, some_long, start, end, run_size)
+    _merge_runs((number, source), in_runs, some_long, start, end, sizes[-1])
     return number, source, start, end
+
+
+def _start_of_run(entry: UInt32, first: UInt32, size: int) -> UInt32:
+    """Where the run of `size` entries begins that an entry of the list from `first` is in."""
+    return first + ((entry - first) & ~ad.UInt32(size - 1))
 
 
 def _merge_runs(
@@ -103,7 +122,7 @@ def _merge_runs(
         first, last = dr.gather(ad.UInt32, start, here), dr.gather(ad.UInt32, end, here)
         is_long = last - first > run_size
         own = dr.gather(ad.Array2u64, entries, entry, is_long)
-        run = first + ((entry - first) & ~ad.UInt32(run_size - 1))
+        run = _start_of_run(entry, first, run_size)
         others = _search_others(entries, own[0], run, first, dr.select(is_long, last, first), run_size)
         for value, target in zip(own, targets, strict=True):
             dr.scatter(target, ad.UInt32(value), first + (entry - run) + others, is_long)

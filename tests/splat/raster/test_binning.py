@@ -163,11 +163,11 @@ def test_lists_made_without_a_wait_are_the_same_where_they_fit(way, spare):
     assert number.wait() == sum(map(len, listed(lists))) == 0
 
 
-@pytest.mark.parametrize("runs", [(4, 16), (4, 4096), (64, 4096), (8, 8)])
+@pytest.mark.parametrize("sizes", [(4, 16), (4, 4096), (64, 4096), (8, 8), (4, 8, 32, 128), (2, 4, 8, 4096), None])
 @pytest.mark.parametrize(
     "lengths", [[1], [0, 5, 0], [300, 0, 17, 1, 64], [16, 4, 15, 17, 3], [2000, 3, 1500], [0, 0, 1]]
 )
-def test_lists_of_any_length_are_ordered(lengths, runs):
+def test_lists_of_any_length_are_ordered(lengths, sizes):
     """Against numpy's sort; lists longer than a run, as long, and shorter; many equal keys."""
     rng = np.random.default_rng(sum(lengths))
     members = np.repeat(np.arange(len(lengths)), lengths)
@@ -176,7 +176,7 @@ def test_lists_of_any_length_are_ordered(lengths, runs):
     size = len(members)
     keys, numbers = rng.integers(0, 9, size), rng.permutation(size)
     arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, keys, numbers))
-    number, source, start, end = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, runs))
+    number, source, start, end = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, sizes))
     np.testing.assert_array_equal(end - start, lengths)
     for i, (s, e) in enumerate(zip(start, end, strict=True)):
         mine = np.flatnonzero(members == i)
