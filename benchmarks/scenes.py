@@ -3,10 +3,10 @@
     python benchmarks/scenes.py --out OUT [--craft boxsat,telescope,upper-stage,cubesat,station,lander] [--preset fast]
                                 [--suns 16] [--views 40] [--resolution 256] [--samples 1024] [--seeds 1] [--json]
 
-Each craft stands alone among cameras all around, station and lander as mesh files that the benchmark writes. Methods
-are `relight`, which casts no shadows, and the one of --method. PSNR over the silhouette, BER by brightness, "gap": by
-how much Suns of training are better. With several seeds, of training: means over them, and the deviation of the gain.
-What is done already is not done again.
+Each craft stands alone among cameras all around, station and lander as mesh files that the benchmark writes. Beside the
+method of --method stands the same without shadows, all else being equal. PSNR over the silhouette, BER by brightness,
+"gap": by how much Suns of training are better. With several seeds, of training: means over them, and the deviation of
+the gain. What is done already is not done again.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from support import common, craft
 from spacesim import backend
 from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import EvaluateConfig
-from spacesim.splat.train.config import METHODS, preset, with_options
+from spacesim.splat.train.config import METHODS, TrainConfig, preset, with_options
 
 CRAFT = "boxsat", "telescope", "upper-stage", "cubesat", *craft.NAMES
 
@@ -54,9 +54,10 @@ def rows_of(names: list[str], options: Any) -> Iterator[common.Row]:
         folder = options.out / name
         path = craft.write(name, folder / "mesh") if name in craft.NAMES else alone(name, folder)
         data = read_dataset(common.generated(str(path), folder / "data", **scene, resolution=options.resolution))
+        config = with_options(preset(options.preset, options.method), iterations=options.iterations)
         without, method = (
-            [trained(method, seed, data, folder, options) for seed in range(options.seeds)]
-            for method in ("relight", options.method)
+            [trained(label, replace(row, seed=seed), data, folder) for seed in range(options.seeds)]
+            for label, row in (("no shadows", without_shadows(config)), (options.method, config))
         )
         yield {"craft": name, **summary(without, method)}
 
@@ -69,11 +70,15 @@ def alone(name: str, folder: Path) -> Path:
     return path
 
 
-def trained(method: str, seed: int, data: Any, folder: Path, options: Any) -> common.Row:
-    config = replace(with_options(preset(options.preset, method), iterations=options.iterations), seed=seed)
-    return common.measured(
-        f"{folder.name}, {method}", config, EvaluateConfig(geometry=None), data, folder / f"{method}-{seed}"
-    )
+def without_shadows(config: TrainConfig) -> TrainConfig:
+    """`relight` with all that `config` has beside shadows."""
+    assert config.light is not None
+    return replace(config, method="relight", light=replace(config.light, shadow=None))
+
+
+def trained(label: str, config: TrainConfig, data: Any, folder: Path) -> common.Row:
+    out = folder / f"{label}-{config.seed}"
+    return common.measured(f"{folder.name}, {label}", config, EvaluateConfig(geometry=None), data, out)
 
 
 def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:

@@ -122,17 +122,21 @@ def backward(
     the same bits in every run.
     """
     parts: list[Float] = []  # of each matrix, of the last layer first: gradients of the bias, of the weights
-    grad_values = grad_output
+    grad_values, by_bias = grad_output, _sums_of_rows(grad_output)
     for i in reversed(range(shape.layers)):
         rows, columns = shape.sizes[i]
-        parts.append(_sums_of_rows(grad_values))
-        parts.append(_product(grad_values, tape[i], Bt=True).array)
+        parts.append(by_bias)
         if i > 0 and _is_few(rows):
-            grad_values = _adjoint_of_few(weights[1 + 2 * i], columns, grad_values)
-        else:
-            grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
+            warps = _outer_of_few(grad_values, tape[i])
+            grad_values = dr.select(tape[i] > 0, _adjoint_of_few(weights[1 + 2 * i], columns, grad_values), 0)
+            by_bias = _sums_of_rows(grad_values)  # one kernel with the warps' sums
+            parts.append(_sums_of_warps(warps, tape[i].shape[2]))
+            continue
+        parts.append(_product(grad_values, tape[i], Bt=True).array)
+        grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
+            by_bias = _sums_of_rows(grad_values)
     sums = _over_matrices(parts, grad_output.shape[0])[::-1]
     grad_bias = sums[1]
     rows, columns = shape.sizes[0]
@@ -208,11 +212,31 @@ def _sums_of_rows(values: TensorXf) -> Float:
     warp = dr.arange(ad.UInt32, dr.width(values.array)) // WARP
     dr.scatter_reduce(dr.ReduceOp.Add, warps, values.array, warp, mode=dr.ReduceMode.Local)
     dr.eval(values, warps)
+    return _sums_of_warps(warps, m)
+
+
+def _sums_of_warps(warps: Float, m: int) -> Float:
+    """Of sums over `WARP` of m numbers each, those over all m."""
     return dr.block_reduce(dr.ReduceOp.Add, warps, m // WARP)
 
 
 def _is_few(rows: int) -> bool:
     return rows <= FEW and select() == "cuda"
+
+
+def _outer_of_few(gradient: TensorXf, items: TensorXf) -> Float:
+    """`_product` of a gradient [B, rows, m] with items [B, C, m] transposed, for `_sums_of_warps`: part of the kernel
+    that computes what has as many numbers as the items."""
+    (matrices, rows, m), columns = gradient.shape, items.shape[1]
+    entry = dr.arange(ad.UInt32, matrices * columns * m)
+    number, column, within = entry // (columns * m), (entry // m) % columns, entry % m
+    warps = dr.zeros(ad.Float, rows * matrices * columns * (m // WARP))
+    for i in range(rows):
+        row = number * rows + i
+        product = items.array * dr.gather(ad.Float, gradient.array, row * m + within)
+        place = (row * columns + column) * (m // WARP) + within // WARP
+        dr.scatter_reduce(dr.ReduceOp.Add, warps, product, place, mode=dr.ReduceMode.Local)
+    return warps
 
 
 def _adjoint_of_few(matrix: Float, columns: int, gradient: TensorXf) -> TensorXf:

@@ -50,7 +50,7 @@ class Grid:
     @staticmethod
     def of(width: int, height: int) -> "Grid":
         """For a picture of width x height pixels."""
-        shape = tile_shape()
+        shape = tile_shape(width, height)
         return Grid(-(-width // shape.width), -(-height // shape.height), shape)
 
     @property

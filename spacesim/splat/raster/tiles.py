@@ -8,6 +8,7 @@ from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32
 
 STEPS = 8  #: sizes of arrays from one power of two to the next, as a rule
+SMALL = 2**18  #: pixels of a picture up to which tiles on CUDA are half as large
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,13 @@ class TileShape:
         return self.pixels // self.columns
 
 
-def tile_shape() -> TileShape:
-    """The fastest shape measured for the backend (docs/research/speed.md). One tile is one warp on CUDA, a part of a
-    packet on LLVM, whose packets have 4 threads or a multiple: a tile's gradients meet in an order that is fixed."""
-    return TileShape(8, 8, 32) if select() == "cuda" else TileShape(8, 8, 4, columns=2)
+def tile_shape(width: int, height: int) -> TileShape:
+    """The fastest shape measured for the backend and a picture of so many pixels: one of few has few tiles, and threads
+    of a large device would wait for the longest lists. One tile is one warp on CUDA, a part of a packet on LLVM, whose
+    packets have 4 threads or a multiple: a tile's gradients meet in an order that is fixed."""
+    if select() == "llvm":
+        return TileShape(8, 8, 4, columns=2)
+    return TileShape(8, 4, 32) if width * height <= SMALL else TileShape(8, 8, 32)
 
 
 @dataclass

@@ -99,7 +99,7 @@ def test_slots_are_the_splats_own(way):
 @pytest.mark.parametrize(("count", "size"), [(2000, (64, 64)), (500, (33, 90)), (9000, (8, 8))])
 def test_both_ways_list_the_same(count, size, monkeypatch):
     splats, footprints = projected(count, *size)
-    monkeypatch.setattr(binning, "tile_shape", lambda: tiles.TileShape(16, 8, 16))
+    monkeypatch.setattr(binning, "tile_shape", lambda *_: tiles.TileShape(16, 8, 16))
     found = []
     for name in WAYS:
         use(name, monkeypatch)

@@ -351,7 +351,7 @@ def _replay(
     state = dr.gather(ad.UInt32, lists.end, thread.tile), transmittance, [ad.Float(0) for _ in offsets]
     dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
     dr.eval(slots)
-    gradients: Splats = gather_slots(slots, events, lists, 0).splats
+    gradients: Splats = gather_slots(slots, events, lists, 0, absolute=False).splats
     return gradients
 
 
