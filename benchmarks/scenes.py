@@ -73,7 +73,7 @@ def alone(name: str, folder: Path) -> Path:
 def without_shadows(config: TrainConfig) -> TrainConfig:
     """`relight` with all that `config` has beside shadows."""
     assert config.light is not None
-    return replace(config, method="relight", light=replace(config.light, shadow=None))
+    return replace(config, light=replace(config.light, shadow=None))
 
 
 def trained(label: str, config: TrainConfig, data: Any, folder: Path) -> common.Row:
