@@ -7,9 +7,9 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.data.records import Camera
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.loss.photometric import photometric_loss

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
         Array2f,
         Array3f,
         Array4f,
-        Array4u,
         ArrayXf,
         Bool,
         Float,
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
         UInt64,
     )
 else:
-    Array2f = Array3f = Array4f = Array4u = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array3f = Array4f = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
 
 ArrayT = TypeVar("ArrayT", Float, Array3f)  #: the same type in and out
 NumberT = TypeVar("NumberT", Float, UInt32, Int32)  #: the same type in and out, of one dimension
@@ -30,7 +29,6 @@ __all__ = [
     "Array2f",
     "Array3f",
     "Array4f",
-    "Array4u",
     "ArrayT",
     "ArrayXf",
     "Bool",

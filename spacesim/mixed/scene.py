@@ -29,14 +29,14 @@ from spacesim.nerf.scene import DrawnScene, FieldScene
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import ComposeConfig, GaussianComposition, LitGaussians
 from spacesim.splat.light.shadow.mapping import SunView
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import Pinhole
+from spacesim.splat.raster.lists.bin import bin_splats
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.output import RenderOutput, over_alpha
 from spacesim.splat.raster.project import Footprints
 from spacesim.splat.raster.project import Splats as Projected
 from spacesim.splat.raster.render import blend, median_depth, prepare
 from spacesim.splat.raster.supersample import render_supersampled, upsampled_camera
-from spacesim.splat.raster.tiles import TileLists
 
 COMMON = 4  #: features that both have: colour, visibility
 

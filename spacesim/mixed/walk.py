@@ -12,6 +12,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -23,7 +24,6 @@ from spacesim.splat.raster.records import (
     packets,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 OF_SPLAT = 6  #: numbers of a splat's record before its depth and its features
 

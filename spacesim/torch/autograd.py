@@ -17,12 +17,12 @@ from torch.autograd.function import FunctionCtx, once_differentiable
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.lists.bin import bin_splats
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.render import FEATURES_PER_PASS
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 from spacesim.torch.convert import as_base, column, columns, rows, to_floats, to_table, to_tensor
 from spacesim.torch.projection import (
     INTRINSICS,

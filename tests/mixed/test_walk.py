@@ -9,9 +9,9 @@ from splats import random_splats
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.mixed.walk import Segments, blend_segments, listed
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.project import ALPHA_MIN, project
 from spacesim.splat.raster.records import ALPHA_MAX
 

@@ -12,8 +12,8 @@ from PIL import Image
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import intrinsics_of, read_dataset, write_points
-from spacesim.splat.raster import bin as binning
 from spacesim.splat.raster.gaussians import SH_C0
+from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.reference.rasterizer import render_reference
 
 VIEWS, TESTS, SIZE = 8, 2, 32

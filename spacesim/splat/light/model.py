@@ -30,10 +30,10 @@ from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.light.surroundings import HeldSurroundings, Surfaces, Surroundings, look_around, ray_count
-from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.picture_lists import computed
+from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.pictures import computed
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float, TensorXf, UInt32
-from spacesim.splat.raster.tiles import round_capacity
+from spacesim.splat.raster.lists.tiles import round_capacity
 
 CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
 

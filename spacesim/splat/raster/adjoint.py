@@ -17,6 +17,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.lists.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -32,7 +33,6 @@ from spacesim.splat.raster.records import (
     packets,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 
 COPIES_BYTES = 2**30  #: that copies of gradient slots, one a CPU thread, may take
 PACKET = 4  #: SIMD lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
@@ -340,9 +340,7 @@ def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
-def gather_slots(
-    slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool = True
-) -> SplatGradients:
+def gather_slots(slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
 
     slots: arrays [F P], F of a pair's sums side by side in each

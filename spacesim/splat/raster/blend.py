@@ -14,6 +14,7 @@ import drjit as dr
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -28,7 +29,6 @@ from spacesim.splat.raster.records import (
     load,
     store,
 )
-from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 
 BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once

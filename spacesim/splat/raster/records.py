@@ -8,8 +8,8 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import ArrayXf, Bool, Float, NumberT, UInt32
+from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
-from spacesim.splat.raster.tiles import TileLists, TileShape
 
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 POWER_MIN = math.log2(ALPHA_MIN)  #: of what is blended

@@ -11,16 +11,16 @@ import drjit as dr
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
 from spacesim.data.structure import checked
-from spacesim.splat.raster.bin import Boxes, Grid, bin_splats, make_boxes, make_lists
 from spacesim.splat.raster.blend import blend_lists, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
+from spacesim.splat.raster.lists.bin import Boxes, Grid, bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.lists.pictures import Kind, expected_capacity, observe
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
-from spacesim.splat.raster.picture_lists import Kind, expected_capacity, observe
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.records import pack_records
 from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals, unit
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
@@ -101,8 +101,8 @@ def _draw_in_stages(
 
 def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats | None, TileLists | None, Planes]:
     """(splats and the tiles' lists, if they are wanted; planes) without gradients and in one pass: one recording where
-    the number of pairs is expected, two, between which the host waits for it, where it is not. More passes in one would
-    hold the memory of all. more: blended beside the outputs"""
+    the number of pairs is expected, which the host reads when all is drawn, two, between which it waits for it, where
+    it is not. More passes in one would hold the memory of all. more: blended beside the outputs"""
     rows, camera, *_ = inputs
     count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
     live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
@@ -116,7 +116,9 @@ def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats | Non
             return drawn
         del drawn  # frees memory for the next
     prepared = _prepare_boxes(inputs, more, live, most, grid)
-    capacity = observe(kind, prepared.boxes.pairs(count))
+    pairs = prepared.boxes.pairs(count)
+    capacity = list_capacity(pairs, size[0] * size[1], few_sizes=True)
+    observe(kind, pairs)
     if capacity == 0:
         return prepared.splats, *_draw_in_stages(prepared.splats, prepared.footprints, prepared.groups, camera)
     return prepared.splats, *_draw_boxes(prepared, size, capacity, most, grid, keeps_lists)
@@ -193,16 +195,8 @@ def _prepare_all(inputs: Inputs, more: Planes) -> tuple[Splats, Footprints, Plan
 
 
 def _whole_features(features: list[Float], count: int) -> list[Float]:
-    """The user's features as Floats [count], each another array, as recorded calls take them."""
-    seen: set[int] = set()
-    whole = []
-    for feature in features:
-        if dr.width(feature) != count or feature.index in seen:
-            feature = feature + dr.zeros(ad.Float, count)
-            dr.make_opaque(feature)
-        seen.add(feature.index)
-        whole.append(feature)
-    return whole
+    """The user's features as Floats [count]."""
+    return [feature if dr.width(feature) == count else feature + dr.zeros(ad.Float, count) for feature in features]
 
 
 def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:

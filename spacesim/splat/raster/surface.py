@@ -10,9 +10,9 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32, UInt64
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, load, packets, store
-from spacesim.splat.raster.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 
 NONE = 2**32 - 1  #: in place of a splat's number
 THICKNESS = 0.05  #: of a disc, in its shorter standard deviation

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from spacesim.backend import select
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.data.errors import WorkError
-from spacesim.splat.raster.bin import LONG, bin_async, bin_counted, check_memory
+from spacesim.splat.raster.lists.bin import LONG, bin_async, bin_counted, check_memory
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 HISTORY = 16  #: changes from a view's last visit to the next, of which the largest counts
 ENOUGH = 4  #: of them, from which on there is a forecast

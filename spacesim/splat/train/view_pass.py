@@ -15,10 +15,10 @@ from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.supersample import upsampled_camera
-from spacesim.splat.raster.tiles import TileLists
 from spacesim.splat.train.async_lists import AsyncTileLists
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients

@@ -35,6 +35,7 @@ from spacesim.splat.light.surroundings import ray_count
 from spacesim.splat.raster import tone
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, gather_entries
+from spacesim.splat.raster.lists import pictures as picture_lists
 from spacesim.splat.raster.render import render, view_colors
 from spacesim.splat.run import Run, draw_lit, load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
@@ -511,6 +512,31 @@ def test_training_pictures_and_baked_colors_have_one_visibility(name):
     np.testing.assert_allclose(visible, drawn, atol=1e-6)
     baked = render(bake(splats, light, SUN), camera).image("color")
     np.testing.assert_allclose(baked, np.tile(0.5 * visible[..., None], 3), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["map", "splat", "bounce"])
+def test_shadows_of_pictures_whose_lists_do_not_fit_are_the_same(monkeypatch, name):
+    """With too little room, then with enough."""
+    light, splats = scattered(name)
+    monkeypatch.setattr(picture_lists, "_capacities", {})
+    suns = [SUN, np.array([0.0, 0.6, 0.8])]
+    wanted = [numbers(light.sunlight(splats, sun).visibility) for sun in suns]
+    monkeypatch.setattr(picture_lists, "BACKENDS", ("cuda", "llvm"))
+    made: list[int] = []
+    plain = picture_lists.bin_async
+
+    def spied(*arguments):
+        made.append(arguments[-1])
+        return plain(*arguments)
+
+    monkeypatch.setattr(picture_lists, "bin_async", spied)
+    light.sunlight(splats, suns[0])
+    picture_lists._capacities.update(dict.fromkeys(picture_lists._capacities, 1))
+    for sun, visibility in zip([*suns, *suns][1:], [*wanted, *wanted][1:], strict=True):
+        np.testing.assert_array_equal(numbers(light.sunlight(splats, sun).visibility), visibility)
+    assert made[0] == 1 < min(made[1:])
+    assert len(made) == 3
+    assert wanted[0].std() > 0.1
 
 
 # ---- features as parameters of Gaussians ----

@@ -11,11 +11,11 @@ from spacesim.backend import ad, recordings, select
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.raster import bin as binning
-from spacesim.splat.raster import tiles
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists import bin as binning
+from spacesim.splat.raster.lists import tiles
+from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
-from spacesim.splat.raster.sort import ordered_lists, segment_ids
 
 pytestmark = pytest.mark.threads
 WAYS = ("cuda", "llvm")

@@ -1,27 +1,39 @@
 """Pictures whose lists the host does not wait for are those that it waits for, to the bit."""
 
+import itertools
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
 import drjit as dr
 import numpy as np
 import pytest
 from splats import random_splats
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.backend.readback import can_read_async
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.raster import bin as binning
-from spacesim.splat.raster import picture_lists
+from spacesim.splat.raster import records
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.picture_lists import Kind, computed, expected_capacity, observe
+from spacesim.splat.raster.lists import bin as binning
+from spacesim.splat.raster.lists import pictures as picture_lists
+from spacesim.splat.raster.lists import tiles
+from spacesim.splat.raster.lists.pictures import Kind, computed, expected_capacity, observe
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 from spacesim.splat.raster.render import render
 
 KIND = Kind(2048, 64, 48)
 
 
-@pytest.fixture(autouse=True)
-def on_any_backend(monkeypatch):
+@pytest.fixture(autouse=True, params=["cuda", "llvm"])
+def on_any_backend(request, monkeypatch):
+    """Each backend's way of making lists, on the backend that runs."""
     assert can_read_async()
+    if request.param != select():
+        if select() == "cuda":
+            pytest.skip("Dr.Jit cannot replay its sort on CUDA")
+        for module in (binning, tiles, records):
+            monkeypatch.setattr(module, "select", lambda: "cuda")
     monkeypatch.setattr(picture_lists, "BACKENDS", ("cuda", "llvm"))
     monkeypatch.setattr(picture_lists, "_capacities", {})
 
@@ -39,6 +51,29 @@ def away() -> Pinhole:
 def drawn(gaussians: Gaussians, view: Pinhole) -> list[np.ndarray]:
     output = render(gaussians, view, outputs=("color", "alpha", "depth", "median_depth"))
     return [np.array(value) for value in (output.color, output.alpha, output.depth, output.median_depth)]
+
+
+@pytest.mark.parametrize("count", [1500, 1501, 1024, 2])
+def test_as_many_splats_as_before_and_others(count, monkeypatch):
+    """Of a recording that serves other numbers, too; twice, so that the second is expected."""
+    gaussians = Gaussians.from_numpy(random_splats(count, count, degree=1))
+    found = [drawn(gaussians, camera(3)) for _ in range(2)]
+    monkeypatch.setattr(picture_lists, "BACKENDS", ())
+    for name, *planes in zip(("color", "alpha", "depth", "median"), *found, drawn(gaussians, camera(3)), strict=True):
+        np.testing.assert_array_equal(planes[0], planes[2], err_msg=name)
+        np.testing.assert_array_equal(planes[1], planes[2], err_msg=name)
+
+
+def test_features_that_are_one_array_or_a_gaussians_own():
+    """Or one number for all; as if each were an array of its own."""
+    gaussians = Gaussians.from_numpy(random_splats(700, 5, degree=0))
+    x = ad.Float(gaussians.means.x)
+    lists = [x, x, gaussians.means.y, gaussians.log_scales.x, x, ad.Float(2)]
+    apart = [ad.Float(np.array(one + dr.zeros(ad.Float, 700)).tolist()) for one in lists]
+    for _ in range(2):
+        found, wanted = (render(gaussians, camera(3), features=features).features for features in (lists, apart))
+        for one, other in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(np.array(one), np.array(other))
 
 
 def test_pictures_near_and_far_and_of_nothing(monkeypatch):
@@ -86,20 +121,37 @@ def test_what_is_computed_with_lists_is_computed_again_where_they_do_not_fit():
     assert computed(lambda make_lists: make_lists(*none, 64, 48).pairs) == 0
 
 
+def seen(kind: Kind, pairs: int) -> int | None:
+    observe(kind, pairs)
+    return expected_capacity(kind)
+
+
 def test_a_capacity_is_kept_while_it_is_enough_and_not_much_too_large():
-    capacity = observe(KIND, 100_000)
-    assert expected_capacity(KIND) == capacity > 100_000
-    assert observe(KIND, 80_000) < capacity
-    assert expected_capacity(KIND) == capacity
-    less = observe(KIND, 40_000)
-    assert expected_capacity(KIND) == less < capacity
+    capacity = seen(KIND, 100_000)
+    assert capacity == binning.rounded_pairs(100_000, few_sizes=False) > 100_000
+    assert seen(KIND, 80_000) == capacity
+    assert seen(KIND, 40_000) == binning.rounded_pairs(40_000, few_sizes=False) < capacity
     assert expected_capacity(Kind(2048, 64, 50)) is None
-    observe(KIND, 0)
-    assert expected_capacity(KIND) is None
-    assert observe(KIND, picture_lists.LONG) > 0
-    assert expected_capacity(KIND) is None
+    assert seen(KIND, 0) is None
+    assert seen(KIND, picture_lists.LONG) is None
+    used = Kind(1024, 10**6, 1)
     for i in range(3 * picture_lists.KINDS):
         observe(Kind(1024, i, 1), 5)
+        observe(used, 5)
+    assert len(picture_lists._capacities) == picture_lists.KINDS
+    assert expected_capacity(used) is not None
+
+
+def test_threads_observe_pictures_of_many_kinds():
+    """More kinds than are kept."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            kinds = [Kind(1024, 1 + i % 150, 1) for i in range(8000)]
+            assert len(list(pool.map(seen, kinds, itertools.repeat(5)))) == 8000
+    finally:
+        sys.setswitchinterval(before)
     assert len(picture_lists._capacities) == picture_lists.KINDS
 
 
@@ -107,6 +159,7 @@ def test_a_capacity_that_finds_no_place_is_not_expected(monkeypatch):
     observe(KIND, 100_000)
     monkeypatch.setattr(picture_lists, "check_memory", refuse)
     assert expected_capacity(KIND) is None
+    observe(KIND, 120_000)  # what is drawn already needs no place
 
 
 def refuse(*_: object, **__: object) -> None:

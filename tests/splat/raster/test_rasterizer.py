@@ -12,11 +12,12 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
-from spacesim.splat.raster import bin as binning
+from spacesim.splat.raster import adjoint, records
 from spacesim.splat.raster import blend as rasterize
-from spacesim.splat.raster import records, tiles
 from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
+from spacesim.splat.raster.lists import bin as binning
+from spacesim.splat.raster.lists import tiles
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.render import render
 from spacesim.splat.reference.rasterizer import real_spherical_harmonics, render_reference
@@ -33,9 +34,12 @@ def way(request, monkeypatch):
     if request.param != select():
         if select() == "cuda":
             pytest.skip("Dr.Jit cannot replay its sort on CUDA")
-        for module in (binning, tiles):
-            monkeypatch.setattr(module, "select", lambda: "cuda")
-        monkeypatch.setattr(rasterize, "select", lambda: "cuda")
+        take_cudas(monkeypatch)
+
+
+def take_cudas(monkeypatch):
+    for module in (binning, tiles, records, adjoint, rasterize):
+        monkeypatch.setattr(module, "select", lambda: "cuda")
 
 
 def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
@@ -347,9 +351,7 @@ def test_pictures_of_few_pixels(size):
 
 def adjoints(arrays, view, channels: int, absolute: bool, monkeypatch) -> list[np.ndarray]:
     """Gradients [N] of weighted sums of `channels` planes: by buckets, then by tiles, with CUDA's tiles."""
-    for module in (binning, tiles):
-        monkeypatch.setattr(module, "select", lambda: "cuda")
-    monkeypatch.setattr(rasterize, "select", lambda: "cuda")
+    take_cudas(monkeypatch)
     splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(view))
     rng, size = np.random.default_rng(4), (view.width, view.height)
     features = [upload(row) for row in rng.normal(size=(channels, len(arrays["means"]))).astype(np.float32)]
@@ -380,6 +382,25 @@ def test_both_adjoints_agree(channels, absolute, logit, monkeypatch):
     assert by_tiles.shape == by_buckets.shape
     for ours, twin in zip(by_buckets, by_tiles, strict=True):
         np.testing.assert_allclose(ours, twin, atol=1e-5 * np.abs(twin).max())
+
+
+def test_pictures_of_many_pixels_have_larger_tiles_on_cuda(monkeypatch):
+    """Which draw the same."""
+    arrays, view, drawn, found = random_splats(300, seed=6), camera(61, 45), [], []
+    take_cudas(monkeypatch)
+    for small in (2**18, 0):
+        monkeypatch.setattr(tiles, "SMALL", small)
+        drawn.append(picture(arrays, view))
+        found.append(adjoints(arrays, view, 3, True, monkeypatch)[0])
+    shapes = [tiles.tile_shape(*size) for size in ((512, 512), (1, 1))]
+    monkeypatch.setattr(tiles, "SMALL", 2**18)
+    assert tiles.tile_shape(512, 512).pixels == 1
+    assert tiles.tile_shape(513, 512) == shapes[0] == shapes[1]
+    assert shapes[0].pixels == 2
+    for name, plane in drawn[0].items():
+        np.testing.assert_allclose(plane, drawn[1][name], atol=1e-6, err_msg=name)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5 * np.abs(other).max())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (8, 8), (9, 1), (1, 17)])

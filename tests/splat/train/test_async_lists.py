@@ -12,8 +12,8 @@ from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import Pinhole, project
-from spacesim.splat.raster.tiles import round_capacity
 from spacesim.splat.train import async_lists
 from spacesim.splat.train.async_lists import ENOUGH, HISTORY, AsyncTileLists, PairForecast
 from spacesim.splat.train.config import TrainConfig, preset

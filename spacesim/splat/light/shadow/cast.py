@@ -31,11 +31,11 @@ from spacesim.splat.light.shadow.splatting import (
     occlude,
     occlusion_by_splatting,
 )
-from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
-from spacesim.splat.raster.tiles import round_capacity
 
 MAX_LIGHT_SIZE = 8192  #: pixels of a side of the light's picture
 UNSEEN = -80.0  #: logit of an opacity that nothing draws

@@ -29,7 +29,7 @@ from spacesim.splat.light.shadow.light_camera import (
 )
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
-from spacesim.splat.raster.tiles import round_capacity
+from spacesim.splat.raster.lists.tiles import round_capacity
 
 MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at
 MAX_CAMERAS = 8  #: K of algorithm 3: the thesis does not say

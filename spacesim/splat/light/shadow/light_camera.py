@@ -16,8 +16,8 @@ from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
+from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import ALPHA_MIN
-from spacesim.splat.raster.tiles import round_capacity
 
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
 REACH = 4.0  #: standard deviations of the whole, on either side of its mean, that a light camera holds at most

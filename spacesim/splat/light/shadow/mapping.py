@@ -16,13 +16,13 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.data.errors import InputError
 from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.light_camera import drawable_mask
-from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.blend import blend_lists
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.surface import NONE, surface_depth, walk
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
 Filter = Literal["bilinear", "percentage-closer", "variance", "median"]

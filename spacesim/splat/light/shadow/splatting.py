@@ -17,9 +17,10 @@ from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
 from spacesim.data.errors import WorkError
 from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
-from spacesim.splat.raster.bin import MakeLists, bin_splats
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -32,7 +33,6 @@ from spacesim.splat.raster.records import (
     packet_sizes,
     store,
 )
-from spacesim.splat.raster.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
 
 BETA_MIN = 0.2  #: a receiver's footprint ends there: 80 % of its weight on 29 % of the area of a cut at 1/255
 TURN = {"cuda": 4, "llvm": 1}  #: events a turn of the loop: their numbers are read at once

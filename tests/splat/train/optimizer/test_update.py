@@ -12,9 +12,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.learning.adam import BETA1, BETA2, EPSILON
-from spacesim.splat.raster.bin import bin_splats
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.optimizer.adam import Adam

@@ -1,10 +1,11 @@
-"""Tile lists of pictures without a wait: with the capacity of the lists of the last picture like it.
+"""Tile lists of pictures with the capacity of those of the last picture like it, so that nothing has to be known before
+they are made.
 
-Who computes with them asks afterwards whether all pairs had their place (`all_fit`), and where they had not, computes
-again, with `bin_splats`. So a picture is the same to the bit, and the host waits for a number that the device has had
-for long. Training knows more of its views: `train/async_lists.py`.
+How many pairs there were is read afterwards, and where not all had their place, lists are made again, as long as they
+have to be. So a picture is the same to the bit. Training knows more of its views: `train/async_lists.py`.
 """
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -14,17 +15,17 @@ import drjit as dr
 from spacesim.backend import select
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.data.errors import WorkError
-from spacesim.splat.raster.bin import (
+from spacesim.splat.raster.lists.bin import (
     LONG,
     MakeLists,
     bin_async,
     bin_counted,
     bin_splats,
     check_memory,
-    list_capacity,
+    rounded_pairs,
 )
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
-from spacesim.splat.raster.tiles import TileLists, round_capacity
 
 T = TypeVar("T")
 
@@ -43,13 +44,14 @@ BACKENDS = ("cuda",)  #: where it pays: on LLVM the host has no time of its own,
 KINDS = 64  #: of pictures whose capacity is kept
 SPARE = 1.5  #: times what is needed, up to which a capacity is kept: pictures of a sequence take turns about a limit
 
-_capacities: dict[Kind, int] = {}
+_capacities: dict[Kind, int] = {}  # the latest used last
+_lock = threading.Lock()
 
 
 def expected_capacity(kind: Kind) -> int | None:
     """Capacity of the lists of the last such picture; None where there was none, where it finds no place in memory, and
     where to wait is no loss."""
-    capacity = _capacities.get(kind) if select() in BACKENDS and can_read_async() else None
+    capacity = _capacities.get(kind) if select() in BACKENDS else None
     if capacity is not None:
         try:
             check_memory(capacity, kind.width * kind.height, training=False)
@@ -58,24 +60,28 @@ def expected_capacity(kind: Kind) -> int | None:
     return capacity
 
 
-def observe(kind: Kind, pairs: int) -> int:
-    """A picture of a kind has so many pairs of tile and splat. Returns the capacity that its lists need, 0 for none.
-    Raises WorkError, see `bin_splats`."""
-    needed = list_capacity(pairs, kind.width * kind.height, kind.few_sizes)
-    if not needed <= _capacities.get(kind, 0) <= SPARE * needed:
-        _capacities.pop(kind, None)
-        if needed > 0 and pairs < LONG:  # of long ones the wait is short beside the work
-            while len(_capacities) >= KINDS:
-                _capacities.pop(next(iter(_capacities)))
-            _capacities[kind] = needed
-    return needed
+def observe(kind: Kind, pairs: int) -> None:
+    """A picture of a kind has so many pairs of tile and splat."""
+    needed = rounded_pairs(pairs, kind.few_sizes)
+    with _lock:
+        before = _capacities.pop(kind, 0)
+        if pairs >= LONG or not pairs:  # of long ones the wait is short beside the work
+            return
+        _capacities[kind] = before if needed <= before <= SPARE * needed else needed
+        if len(_capacities) > KINDS:
+            del _capacities[next(iter(_capacities))]
 
 
 def computed(compute: Callable[[MakeLists], T]) -> T:
     """What `compute` makes with the lists of a function that does as `bin_splats`: without a wait where it can be."""
+    if select() not in BACKENDS or not can_read_async():
+        return compute(bin_splats)
     lists = _PictureLists()
     result = compute(lists.make)
-    return result if lists.all_fit() else compute(bin_splats)
+    if lists.all_fit():
+        return result
+    del result  # frees memory for the next
+    return compute(bin_splats)
 
 
 class _PictureLists:

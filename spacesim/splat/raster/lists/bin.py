@@ -20,9 +20,9 @@ from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber
 from spacesim.data.errors import WorkError
+from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
+from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity, tile_shape
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
-from spacesim.splat.raster.sort import ordered_lists, segment_ids
-from spacesim.splat.raster.tiles import STEPS, TileLists, TileShape, round_capacity, tile_shape
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
@@ -36,7 +36,7 @@ PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour a
 TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
 #: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
 
-BELIEVED = 1  #: seconds for which memory that was free is taken to be
+BELIEVED = 0.1  #: seconds for which memory that was free is taken to be
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,11 @@ def make_boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: 
 def list_capacity(pairs: int, pixels: int, few_sizes: bool, training: bool = False) -> int:
     """Capacity of lists of so many pairs, 0 of none. Raises WorkError, see `bin_splats`."""
     check_memory(pairs, pixels, training)
+    return rounded_pairs(pairs, few_sizes)
+
+
+def rounded_pairs(pairs: int, few_sizes: bool) -> int:
+    """Capacity of lists of so many pairs, whether there is memory for them or not; 0 of none."""
     return round_capacity(pairs, FEW if few_sizes and pairs < LONG else STEPS) if pairs else 0
 
 

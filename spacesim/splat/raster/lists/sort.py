@@ -20,7 +20,7 @@ from spacesim.backend.arrays import Bool, UInt32, UInt64
 SIZES = 64, 4096  #: entries, powers of two: so many are compared each with each (with 32, 128 or 256 an H100 takes
 #: longer); of these as many as are searched in one pass, the lists of pictures being short
 SIZES_OF_LONG = 64, 512, 4096, 32768, 262144  #: passes that take less where lists are long
-LONG = 512  #: entries a list for which there is room, from which on they may be
+ROOM = 512  #: entries a list for which there is room, from which on lists may be long
 WAYS = 4  #: parts of what is left, of which a search takes one: fewer steps than by halves; 8 are slower
 COMPARED = 4  #: entries compared in a turn of the loop
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond the longest run: as many as fill a large device
@@ -59,7 +59,7 @@ def ordered_lists(
     sizes: of the runs that are made one from another, by default `SIZES`, `SIZES_OF_LONG` for lists that may be long
     """
     if sizes is None:
-        sizes = SIZES_OF_LONG if capacity > LONG * lists else SIZES
+        sizes = SIZES_OF_LONG if capacity > ROOM * lists else SIZES
     lengths = dr.zeros(ad.UInt32, lists)
     place = cast(UInt32, dr.scatter_inc(lengths, members, members < lists))
     dr.eval(place, lengths, members, numbers, keys)

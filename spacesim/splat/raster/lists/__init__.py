@@ -1,0 +1,1 @@
+"""Which splats each tile of a picture blends, front to back."""
