@@ -20,6 +20,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_SELF_CAST, load_truth, read_dataset
 from spacesim.eval.suns import known_suns
+from spacesim.splat.light.model import LightModel
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
 from spacesim.splat.light.shadow.light_camera import light_rows
 from spacesim.splat.light.shadow.mapping import MappingConfig
@@ -73,7 +74,7 @@ def main() -> None:
     print(f"{run.gaussians.count} Gaussians, {len(frames)} frames")
     grazing = " | ".join(f"{low}–{high}°" for low, high in itertools.pairwise(EDGES))
     classes = "lit, but dark | cast, but lit | attached, but lit | all of the model"
-    print(f"| shadows | error | balanced | {classes} | dark at {grazing} |")
+    print(f"| shadows | error | mean over frames | balanced | {classes} | dark at {grazing} |")
     raw = () if options.own else raw_shadows(run.gaussians, dataset, options.size)
     for name, visibility in itertools.chain(raw, own_shadows(run)):
         shares = mask_errors(run.gaussians, dataset, frames, visibility)
@@ -98,8 +99,16 @@ def own_shadows(run: Run) -> Iterator[tuple[str, Visibility]]:
     light = run.light
     if light is None or light.config.shadow is None:
         return
+    yield "raw", lambda frame: 1 - shadows_of(light, run, frame)
     yield "refined", lambda frame: light.sunlight(run.gaussians, frame.sun.direction).visibility
     yield "shown", lambda frame: light.shade_picture(run.gaussians, Pinhole.of(frame.camera), frame.sun.direction)[1]
+
+
+def shadows_of(light: LightModel, run: Run, frame: Frame) -> Any:
+    """Raw occlusion of each Gaussian, as the run's method casts it."""
+    shadows = light.shadows(run.gaussians, frame.sun.direction)
+    assert shadows is not None, "of a run with shadows"
+    return shadows.occlusion
 
 
 def unseen(dataset: Dataset) -> list[Frame]:
@@ -113,10 +122,10 @@ def unseen(dataset: Dataset) -> list[Frame]:
 
 
 def mask_errors(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame], visibility: Visibility) -> list[float]:
-    """Of lit and cast-shadow pixels the error rate and the balanced one; share of lit pixels that are dark, of those in
-    cast and in attached shadow that are lit, of all that are wrong; then the share of lit pixels that are dark, by the
-    Sun's elevation over the surface (`EDGES`)."""
-    counts, attached = np.zeros((len(EDGES) - 1, 4)), np.zeros(2)
+    """Of lit and cast-shadow pixels the error rate, its mean over frames that have some, and the balanced one; share
+    of lit pixels that are dark, of those in cast and in attached shadow that are lit, of all that are wrong; then the
+    share of lit pixels that are dark, by the Sun's elevation over the surface (`EDGES`)."""
+    counts, attached, rates = np.zeros((len(EDGES) - 1, 4)), np.zeros(2), list[float]()
     for frame in frames:
         truth = load_truth(dataset, frame)
         seen = render(gaussians, Pinhole.of(frame.camera), outputs=("alpha",), features=[upload(visibility(frame))])
@@ -125,6 +134,8 @@ def mask_errors(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame],
         lit = (truth.shadow == SHADOW_LIT) & (alpha > 0.5)
         cast = (truth.shadow >= SHADOW_SELF_CAST) & (truth.shadow < SHADOW_LIT) & (alpha > 0.5)
         away = (truth.shadow == SHADOW_ATTACHED) & (alpha > 0.5)
+        if (lit | cast).any():
+            rates.append(np.count_nonzero((lit & ~bright) | (cast & bright)) / np.count_nonzero(lit | cast))
         attached += [np.count_nonzero(away), np.count_nonzero(away & bright)]
         above = np.degrees(np.arcsin(np.clip(truth.sun_cosine, -1, 1)))
         for i in range(len(EDGES) - 1):
@@ -134,7 +145,16 @@ def mask_errors(gaussians: Gaussians, dataset: Dataset, frames: Sequence[Frame],
     dark, leaks = lit_dark / lit, cast_lit / cast
     error, through = (lit_dark + cast_lit) / (lit + cast), attached[1] / attached[0]
     wrong = (lit_dark + cast_lit + attached[1]) / (lit + cast + attached[0])
-    return [error, (dark + leaks) / 2, dark, leaks, through, wrong, *(counts[:, 1] / counts[:, 0])]
+    return [
+        error,
+        float(np.mean(rates)),
+        (dark + leaks) / 2,
+        dark,
+        leaks,
+        through,
+        wrong,
+        *(counts[:, 1] / counts[:, 0]),
+    ]
 
 
 if __name__ == "__main__":
