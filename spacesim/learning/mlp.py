@@ -126,20 +126,19 @@ def backward(
     for i in reversed(range(shape.layers)):
         rows, columns = shape.sizes[i]
         parts.append(by_bias)
-        if i > 0 and _is_few(rows):
-            warps = _outer_of_few(grad_values, tape[i])
-            grad_values = dr.select(tape[i] > 0, _adjoint_of_few(weights[1 + 2 * i], columns, grad_values), 0)
-            by_bias = _sums_of_rows(grad_values)  # one kernel with the warps' sums
-            parts.append(_sums_of_warps(warps, tape[i].shape[2]))
-            continue
-        parts.append(_product(grad_values, tape[i], Bt=True).array)
-        grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
+        is_few = i > 0 and _is_few(rows)
+        if is_few:
+            by_weights = _outer_of_few(grad_values, tape[i])
+            grad_values = _adjoint_of_few(weights[1 + 2 * i], columns, grad_values)
+        else:
+            by_weights = _product(grad_values, tape[i], Bt=True).array
+            grad_values = _product(_matrix(shape, weights, i), grad_values, At=True)
         if i > 0:
             grad_values = dr.select(tape[i] > 0, grad_values, 0)
-            by_bias = _sums_of_rows(grad_values)
+            by_bias = _sums_of_rows(grad_values)  # of few rows one kernel with `_outer_of_few`
+        parts.append(_sums_of_warps(by_weights, tape[i].shape[2]) if is_few else by_weights)
     sums = _over_matrices(parts, grad_output.shape[0])[::-1]
     grad_bias = sums[1]
-    rows, columns = shape.sizes[0]
     sums[0] = _columns(sums[0], rows, tape[0].shape[1], columns)
     outer = ad.TensorXf(grad_bias, (rows, 1)) * ad.TensorXf(shared, (1, shape.shared))
     return [outer.array, *sums], grad_values
@@ -224,12 +223,17 @@ def _is_few(rows: int) -> bool:
     return rows <= FEW and select() == "cuda"
 
 
+def _entries(matrices: int, columns: int, m: int) -> tuple[UInt32, UInt32, UInt32]:
+    """(first, second, third index) of each number of a TensorXf [matrices, columns, m]."""
+    entry = dr.arange(ad.UInt32, matrices * columns * m)
+    return entry // (columns * m), (entry // m) % columns, entry % m
+
+
 def _outer_of_few(gradient: TensorXf, items: TensorXf) -> Float:
     """`_product` of a gradient [B, rows, m] with items [B, C, m] transposed, for `_sums_of_warps`: part of the kernel
     that computes what has as many numbers as the items."""
     (matrices, rows, m), columns = gradient.shape, items.shape[1]
-    entry = dr.arange(ad.UInt32, matrices * columns * m)
-    number, column, within = entry // (columns * m), (entry // m) % columns, entry % m
+    number, column, within = _entries(matrices, columns, m)
     warps = dr.zeros(ad.Float, rows * matrices * columns * (m // WARP))
     for i in range(rows):
         row = number * rows + i
@@ -242,8 +246,7 @@ def _outer_of_few(gradient: TensorXf, items: TensorXf) -> Float:
 def _adjoint_of_few(matrix: Float, columns: int, gradient: TensorXf) -> TensorXf:
     """Adjoint of `_product_of_few` by the items, part of the kernel that reads it. gradient: TensorXf [B, rows, m]"""
     matrices, rows, m = gradient.shape
-    entry = dr.arange(ad.UInt32, matrices * columns * m)
-    number, column, within = entry // (columns * m), (entry // m) % columns, entry % m
+    number, column, within = _entries(matrices, columns, m)
     total = ad.Float(0)
     for i in range(rows):
         weight = dr.gather(ad.Float, matrix, i * columns + column)

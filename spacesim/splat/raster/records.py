@@ -14,6 +14,7 @@ from spacesim.splat.raster.project import ALPHA_MIN, Splats
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 POWER_MIN = math.log2(ALPHA_MIN)  #: of what is blended
 TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished before the first splat behind which no more than this would pass
+PACKETS = {"cuda": (1, 2, 4), "llvm": (2, 4, 8)}  #: numbers that a thread reads or adds at once
 LOG2_E = 1.4426950408889634
 
 _EXP2 = (1.0, 0.693147004, 0.240222469, 0.0555071086, 0.00967129413, 0.00132695748)
@@ -81,11 +82,9 @@ def list_records(
 def packet_sizes(numbers: int) -> list[int]:
     """How so many numbers of an entry are divided among arrays, in each of which those of an entry stand side by side:
     a thread reads or adds a packet at once. On LLVM one of eight numbers costs little more than one of four."""
-    rest = numbers % 4
-    if select() == "cuda":
-        return [4] * (numbers // 4) + ([] if rest == 0 else [4] if rest == 3 else [rest])
-    rest = numbers % 8
-    return [8] * (numbers // 8) + ([] if rest == 0 else [2] if rest <= 2 else [4] if rest <= 4 else [8])
+    sizes = PACKETS[select()]
+    rest = numbers % sizes[-1]
+    return [sizes[-1]] * (numbers // sizes[-1]) + ([next(size for size in sizes if size >= rest)] if rest else [])
 
 
 def packets(values: list[Float]) -> list[list[Float]]:

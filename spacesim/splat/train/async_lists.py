@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 from spacesim.backend import select
 from spacesim.backend.readback import AsyncNumber, can_read_async
-from spacesim.data.errors import WorkError
-from spacesim.splat.raster.lists.bin import LONG, bin_async, bin_counted, check_memory
+from spacesim.splat.raster.lists.bin import LONG, bin_async, bin_counted, has_memory
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
 
@@ -100,13 +99,7 @@ class AsyncTileLists:
     def _has_memory(self, capacity: int, pixels: int, training: bool) -> bool:
         """Whether lists of a capacity fit into memory; where they do not, the pairs that there are may. Of long ones
         the wait is short beside the work."""
-        if capacity > LONG:
-            return False
-        try:
-            check_memory(capacity, pixels, training)
-        except WorkError:
-            return False
-        return True
+        return capacity <= LONG and has_memory(capacity, pixels, training)
 
     def all_fit(self) -> bool:
         """Whether all lists since the last time are those of `bin_splats`: the capacity was enough for all pairs, and

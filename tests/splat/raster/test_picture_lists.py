@@ -7,17 +7,16 @@ from concurrent.futures import ThreadPoolExecutor
 import drjit as dr
 import numpy as np
 import pytest
-from splats import random_splats
+from splats import random_splats, take_cudas
 
 from spacesim.backend import ad, select
 from spacesim.backend.readback import can_read_async
+from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
-from spacesim.splat.raster import records
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import pictures as picture_lists
-from spacesim.splat.raster.lists import tiles
 from spacesim.splat.raster.lists.pictures import Kind, computed, expected_capacity, observe
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 from spacesim.splat.raster.render import render
@@ -32,8 +31,7 @@ def on_any_backend(request, monkeypatch):
     if request.param != select():
         if select() == "cuda":
             pytest.skip("Dr.Jit cannot replay its sort on CUDA")
-        for module in (binning, tiles, records):
-            monkeypatch.setattr(module, "select", lambda: "cuda")
+        take_cudas(monkeypatch)
     monkeypatch.setattr(picture_lists, "BACKENDS", ("cuda", "llvm"))
     monkeypatch.setattr(picture_lists, "_capacities", {})
 
@@ -157,13 +155,13 @@ def test_threads_observe_pictures_of_many_kinds():
 
 def test_a_capacity_that_finds_no_place_is_not_expected(monkeypatch):
     observe(KIND, 100_000)
-    monkeypatch.setattr(picture_lists, "check_memory", refuse)
+    monkeypatch.setattr(binning, "check_memory", refuse)
     assert expected_capacity(KIND) is None
     observe(KIND, 120_000)  # what is drawn already needs no place
 
 
 def refuse(*_: object, **__: object) -> None:
-    raise picture_lists.WorkError("no memory")
+    raise WorkError("no memory")
 
 
 def test_a_backend_whose_host_computes_waits(monkeypatch):

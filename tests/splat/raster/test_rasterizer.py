@@ -5,15 +5,15 @@ from functools import cache
 import drjit as dr
 import numpy as np
 import pytest
-from splats import random_splats
+from splats import random_splats, take_cudas
 
 from spacesim.backend import ad, select
 from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
-from spacesim.splat.raster import adjoint, records
 from spacesim.splat.raster import blend as rasterize
+from spacesim.splat.raster import records
 from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.lists import bin as binning
@@ -35,11 +35,6 @@ def way(request, monkeypatch):
         if select() == "cuda":
             pytest.skip("Dr.Jit cannot replay its sort on CUDA")
         take_cudas(monkeypatch)
-
-
-def take_cudas(monkeypatch):
-    for module in (binning, tiles, records, adjoint, rasterize):
-        monkeypatch.setattr(module, "select", lambda: "cuda")
 
 
 def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
@@ -512,8 +507,7 @@ def test_the_number_of_threads_does_not_show():
 def test_frames_are_drawn_as_pictures_with_gradients_are(lists, monkeypatch):
     """Recorded for some Gaussians, replayed for others; by the lists of this backend and, on any, by CUDA's."""
     if lists == "cuda":
-        for module in (binning, tiles, rasterize):
-            monkeypatch.setattr(module, "select", lambda: "cuda")
+        take_cudas(monkeypatch)
     outputs = ("color", "depth", "median_depth", "normal")
     for count in (300, 290, 1500, 1400):
         gaussians, camera_ = Gaussians.from_numpy(random_splats(count, seed=count)), Pinhole.of(camera())

@@ -181,6 +181,15 @@ def check_memory(pairs: int, pixels: int, training: bool) -> None:
     _found.note(needed)
 
 
+def has_memory(pairs: int, pixels: int, training: bool) -> bool:
+    """Whether `check_memory` raises nothing."""
+    try:
+        check_memory(pairs, pixels, training)
+    except WorkError:
+        return False
+    return True
+
+
 class _Found:
     """Memory that was free a moment ago: to ask takes as long as some kernels."""
 

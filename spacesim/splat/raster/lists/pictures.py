@@ -14,14 +14,13 @@ import drjit as dr
 
 from spacesim.backend import select
 from spacesim.backend.readback import AsyncNumber, can_read_async
-from spacesim.data.errors import WorkError
 from spacesim.splat.raster.lists.bin import (
     LONG,
     MakeLists,
     bin_async,
     bin_counted,
     bin_splats,
-    check_memory,
+    has_memory,
     rounded_pairs,
 )
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
@@ -52,11 +51,8 @@ def expected_capacity(kind: Kind) -> int | None:
     """Capacity of the lists of the last such picture; None where there was none, where it finds no place in memory, and
     where to wait is no loss."""
     capacity = _capacities.get(kind) if select() in BACKENDS else None
-    if capacity is not None:
-        try:
-            check_memory(capacity, kind.width * kind.height, training=False)
-        except WorkError:
-            return None
+    if capacity is None or not has_memory(capacity, kind.width * kind.height, training=False):
+        return None
     return capacity
 
 

@@ -80,16 +80,19 @@ def ordered_lists(
     entries = _packed(*own, chunk + rank, live, capacity)
     dr.eval(entries)
 
-    for size, larger in itertools.pairwise(sizes):
+    def in_run(size: int, larger: int) -> tuple[tuple[UInt64, UInt64], UInt32, UInt32]:
+        """(what an entry holds, its place when runs of `size` are put together to `larger` ones, its list's length)."""
         own, first, last = _own(entries, entry, live, start, end)
         chunk, run = _start_of_run(entry, first, size), _start_of_run(entry, first, larger)
         others = _search_others(entries, own[0], chunk, run, dr.minimum(run + larger, last), size)
-        place = dr.select(live, run + (entry - chunk) + others, entry)
-        if larger == sizes[-1]:
-            break
+        return own, dr.select(live, run + (entry - chunk) + others, entry), last - first
+
+    for size, larger in itertools.pairwise(sizes[:-1]):
+        own, place, _ = in_run(size, larger)
         entries = _packed(*own, place, live, capacity)
         dr.eval(entries)
-    is_long = live & (last - first > sizes[-1])
+    own, place, length = in_run(*sizes[-2:])
+    is_long = live & (length > sizes[-1])
     in_runs = _packed(*own, place, is_long, capacity)
     number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
     dr.scatter(number, dr.select(live, ad.UInt32(own[0]), 0), place)
