@@ -519,6 +519,7 @@ def test_shadows_of_pictures_whose_lists_do_not_fit_are_the_same(monkeypatch, na
     """With too little room, then with enough."""
     light, splats = scattered(name)
     monkeypatch.setattr(picture_lists, "_capacities", {})
+    monkeypatch.setattr(picture_lists, "BACKENDS", ())
     suns = [SUN, np.array([0.0, 0.6, 0.8])]
     wanted = [numbers(light.sunlight(splats, sun).visibility) for sun in suns]
     monkeypatch.setattr(picture_lists, "BACKENDS", ("cuda", "llvm"))
