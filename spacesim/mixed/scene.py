@@ -216,7 +216,7 @@ def _blend_splats(
         lists = bin_splats(empty, nowhere, camera.width, camera.height)
         planes = np.zeros((3 + COMMON + 3 * normals + len(lit.shares), size), np.float32)
         planes[0] = 1
-        return ListedSplats([], lists, COMMON + 3 * normals + len(lit.shares)), planes
+        return ListedSplats([], 0, lists, COMMON + 3 * normals + len(lit.shares)), planes
     outputs = ("depth", "normal") if normals else ("depth",)
     splats, footprints, groups = prepare(gaussians.rows(), camera, None, outputs, antialiased)
     seen = dr.full(ad.Float, 1, gaussians.count) if lit.visibility is None else lit.visibility

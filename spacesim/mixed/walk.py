@@ -21,6 +21,8 @@ from spacesim.splat.raster.records import (
     exp2,
     list_records,
     load,
+    load_listed,
+    pack_records,
     packets,
     store,
 )
@@ -42,20 +44,22 @@ class Segments:
 class ListedSplats:
     """The splats of a picture's tiles, nearest first, with their features."""
 
-    records: list[Float]  #: see `list_records`; the first feature is the depth
+    records: list[Float]  #: of `list_records`; the first feature is the depth
+    capacity: int  #: of `pack_records`
     lists: TileLists  #: which splats each tile has
     features: int  #: without the depth
 
 
 def listed(splats: Splats, features: list[Float], lists: TileLists) -> ListedSplats:
     """For `blend_segments`. features: [N] each"""
-    records = _records(splats, [splats.depth, *features], lists, round_capacity(dr.width(splats.x)))
-    return ListedSplats(records, lists, len(features))
+    capacity = round_capacity(dr.width(splats.x))
+    records = _records(splats, [splats.depth, *features], lists, capacity)
+    return ListedSplats(records, capacity, lists, len(features))
 
 
 @recorded
 def _records(splats: Splats, features: list[Float], lists: TileLists, capacity: int) -> list[Float]:
-    return list_records(splats, features, lists, capacity)
+    return list_records(pack_records(splats, features, capacity), capacity, lists)
 
 
 @dataclass
@@ -158,4 +162,4 @@ def blend_segments(
 def _splat(splats: ListedSplats, k: UInt32, active: Bool) -> list[Float]:
     if splats.lists.capacity == 0:  # there is none
         return [ad.Float(0)] * (OF_SPLAT + 1 + splats.features)
-    return load(splats.records, k, splats.lists.capacity, active)
+    return load_listed(splats.records, splats.capacity, splats.lists, k, active)

@@ -28,6 +28,7 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     load,
+    load_listed,
     packet,
     packet_sizes,
     packets,
@@ -85,14 +86,14 @@ def by_tiles(
     sizes = packet_sizes(_numbers(channels, absolute))
     mode = reduce_mode(4 * sum(sizes) * lists.capacity, shape)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in sizes]
-    records, start = state.records, dr.gather(ad.UInt32, lists.start, thread.tile)
+    start = dr.gather(ad.UInt32, lists.start, thread.tile)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
 
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
-        record = load(records, k, lists.capacity)
+        record = load_listed(state.records, state.capacity, lists, k)
         dx, dy = thread.x - record[0], thread.y - record[1]
         a, b, c = record[2], record[3], record[4]
         powers = exponents(record, thread.x, thread.y, shape)
@@ -185,11 +186,11 @@ def _fours(channels: int, absolute: bool) -> int:
 
 @dataclass
 class _Buckets:
-    """Of each bucket [B]: its tile, the tile's left and top edges in pixels, and its pairs from `first` to below `end`
-    of the tile, none where no thread of blending reached it."""
+    """Of each bucket [B]: its tile, whether a thread of blending reached it, the tile's left and top edges in pixels,
+    and its pairs, from `first` on, below `end` of the tile."""
 
     tile: UInt32
-    live: Bool
+    reached: Bool
     left: Float
     top: Float
     first: UInt32
@@ -213,8 +214,8 @@ def by_buckets(
     tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
     number = dr.arange(ad.UInt32, bucket_count)
     buckets = _buckets(state, lists, number)
-    records = [_record(state, buckets, i, lists.capacity) for i in range(bucket)]
-    until = dr.select(buckets.live, ad.UInt32(pixels), ad.UInt32(0))
+    records = [_record(state, buckets, i, lists) for i in range(bucket)]
+    until = dr.select(buckets.reached, ad.UInt32(pixels), ad.UInt32(0))
 
     def has_more(q: UInt32, _sums: object) -> Bool:
         return q < until
@@ -238,7 +239,7 @@ def by_buckets(
     zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
     _, sums = dr.while_loop((ad.UInt32(0), zeros), has_more, visit, mode="symbolic", label="buckets")
     fours = _fours(channels, absolute)
-    slots = dr.zeros(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side
+    slots = dr.empty(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side, of all that are listed
     for i in range(bucket):
         listed = buckets.first + i < buckets.end
         slot = lists.sum_index(buckets.first + i, listed)
@@ -287,19 +288,20 @@ def _add_pixel(
 
 def _buckets(state: BlendState, lists: TileLists, number: UInt32) -> _Buckets:
     tile, shape = dr.gather(ad.UInt32, state.bucket_tile, number), lists.shape
-    live = tile < lists.tiles_x * lists.tiles_y
-    tile = dr.select(live, tile, 0)
+    exists = tile < lists.tiles_x * lists.tiles_y
+    tile = dr.select(exists, tile, 0)
     start = dr.gather(ad.UInt32, lists.start, tile)
     first = start + (number - (start // state.bucket + tile)) * state.bucket
-    end = dr.select(live, dr.gather(ad.UInt32, lists.end, tile), 0)
+    end = dr.select(exists, dr.gather(ad.UInt32, lists.end, tile), 0)
     left, top = (tile % lists.tiles_x) * shape.width, (tile // lists.tiles_x) * shape.height
-    return _Buckets(tile, live, ad.Float(left), ad.Float(top), first, end)
+    reached = exists & (dr.gather(ad.UInt32, state.bucket_reached, number) > 0)
+    return _Buckets(tile, reached, ad.Float(left), ad.Float(top), first, end)
 
 
-def _record(state: BlendState, buckets: _Buckets, i: int, capacity: int) -> list[Float]:
+def _record(state: BlendState, buckets: _Buckets, i: int, lists: TileLists) -> list[Float]:
     """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
-    return load(state.records, buckets.first + i, capacity, listed)
+    return load_listed(state.records, state.capacity, lists, buckets.first + i, listed)
 
 
 def _pixel_packets(
@@ -357,7 +359,8 @@ def gather_slots(slots: list[Float], splats: Splats, lists: TileLists, channels:
     def add(position: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
         for u in range(turn):
             at = position + u
-            values = load(slots, lists.sum_of_slot(at), lists.capacity, at < end if u else True)
+            has_sum = lists.has_sum(at, at < end if u else ad.Bool(True))
+            values = load(slots, lists.sum_of_slot(at), lists.capacity, has_sum)
             sums = [total + value for total, value in zip(sums, values, strict=True)]
         return position + turn, sums
 

@@ -26,7 +26,8 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     list_records,
-    load,
+    load_listed,
+    pack_records,
     store,
 )
 
@@ -62,18 +63,20 @@ def blend_lists(
     height: int,
     capacity: int,
     bucket: int | None = None,
-    packed: list[Float] | None = None,
+    records: list[Float] | None = None,
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
+    adjoint, 0 for that by tiles, None where there is none;  records: `pack_records`, where they are there"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = TURN[select()]
     assert not bucket or bucket % turn == 0, "a bucket is some turns of the loop"
-    records = list_records(splats, features, lists, capacity, packed)
+    if records is None and lists.capacity > 0:
+        records = pack_records(splats, features, capacity)
+    records = list_records(records or [], capacity, lists)
     thread = thread_pixels(lists)
-    start = dr.gather(ad.UInt32, lists.start, thread.tile)
-    snapshots = _Checkpoints(lists, bucket, channels, thread.place, start) if bucket else None
+    start, end = (dr.gather(ad.UInt32, bounds, thread.tile) for bounds in (lists.start, lists.end))
+    snapshots = _Checkpoints(lists, bucket, channels, thread.place, start, end) if bucket else None
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) > 0)
@@ -86,7 +89,7 @@ def blend_lists(
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
-            record = load(records, k + u, lists.capacity, listed)
+            record = load_listed(records, capacity, lists, k + u, listed)
             powers = exponents(record, thread.x, thread.y, shape)
             for p in range(pixels):
                 alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
@@ -104,7 +107,7 @@ def blend_lists(
 
     state = (
         start,
-        dr.gather(ad.UInt32, lists.end, thread.tile),
+        end,
         [ad.Float(1) for _ in range(pixels)],
         [[ad.Float(0) for _ in range(channels)] for _ in range(pixels)],
         [ad.UInt32(0) for _ in range(pixels)],
@@ -127,9 +130,11 @@ def blend_lists(
             transmittance=store(transmittance, thread.place, threads),
             last=store(last, thread.place, threads),
             records=records,
+            capacity=capacity,
             bucket=bucket,
             checkpoints=snapshots.states if snapshots else [],
             bucket_tile=snapshots.tile if snapshots else None,
+            bucket_reached=snapshots.reached if snapshots else None,
         )
     dr.eval(planes, kept)
     return BlendResult(planes[1:], planes[0], kept)
@@ -138,22 +143,38 @@ def blend_lists(
 class _Checkpoints:
     """What the blending loop keeps of pixels before each bucket, see `BlendState`.
 
-    thread (its place), start: [T * threads]"""
+    thread (its place), start, end (of its list): [T * threads]"""
 
-    def __init__(self, lists: TileLists, bucket: int, channels: int, thread: UInt32, start: UInt32) -> None:
+    def __init__(
+        self, lists: TileLists, bucket: int, channels: int, thread: UInt32, start: UInt32, end: UInt32
+    ) -> None:
         numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
         pixels = lists.shape.width * lists.shape.height
         self.shape, self.bucket, self.start = lists.shape, bucket, start
         self.tile_number, self.within = thread // lists.shape.threads, thread % lists.shape.threads
         self.first = start // bucket + self.tile_number
         self.states = [dr.empty(ad.Float, 4 * numbers * pixels) for _ in range(fours)]
+        self.reached = dr.zeros(ad.UInt32, numbers)
         self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
+        self._number_tiles(self.first + (end - start + (bucket - 1)) // bucket)
+
+    def _number_tiles(self, end: UInt32) -> None:
+        """Of all buckets, those of a thread's tile up to number `end`."""
+
+        def has_more(number: UInt32) -> Bool:
+            return number < end
+
+        def write(number: UInt32) -> tuple[UInt32]:
+            dr.scatter(self.tile, self.tile_number, number)
+            return (number + self.shape.threads,)
+
+        dr.while_loop((self.first + self.within,), has_more, write, mode="symbolic", label="buckets")
 
     def keep(self, k: UInt32, transmittance: list[Float], sums: list[list[Float]]) -> None:
         """Before pair k, where a bucket starts there; of the pixels whose thread still walks."""
         starts = ((k - self.start) & (self.bucket - 1)) == 0
         number, pixels = self.first + (k - self.start) // self.bucket, self.shape.pixels
-        dr.scatter(self.tile, self.tile_number, number, active=starts)  # whichever thread still walks
+        dr.scatter(self.reached, ad.UInt32(1), number, active=starts)  # whichever thread still walks
         for p in range(pixels):
             values = [transmittance[p], *sums[p]]
             values += [ad.Float(0)] * (-len(values) % 4)

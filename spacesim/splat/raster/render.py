@@ -151,7 +151,7 @@ def _prepare_boxes(inputs: Inputs, more: Planes, count: UInt32, capacity: int, g
     """Of `count` splats [capacity]. more: blended beside the outputs"""
     splats, footprints, groups = _prepare_all(inputs, more)
     records = pack_records(splats, _features(groups), capacity)
-    dr.eval(splats, footprints, groups, records)
+    dr.eval(splats, footprints, groups)
     return _Prepared(splats, footprints, groups, records, make_boxes(splats, footprints, count, capacity, grid))
 
 
@@ -162,7 +162,7 @@ def _draw_boxes(
     """(the lists, of `capacity`, if they are wanted; planes)."""
     splats, groups = prepared.splats, prepared.groups
     lists = make_lists(splats, prepared.footprints, prepared.boxes, capacity, splat_capacity, grid)
-    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, packed=prepared.records)
+    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, records=prepared.records)
     return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, groups)
 
 

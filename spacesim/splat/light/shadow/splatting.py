@@ -29,7 +29,8 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     list_records,
-    load,
+    load_listed,
+    pack_records,
     packet_sizes,
     store,
 )
@@ -188,13 +189,13 @@ def _depth(means: Array3f, camera: Orthographic) -> Float:
 class _WalkTape:
     """What `_replay` needs of `_walk`.
 
-    Tile-major: transmittance and one past the last blocker of each pixel [T * pixels of a tile]; the events' records in
-    list order, see `records.BlendState`.
+    Tile-major: transmittance and one past the last blocker of each pixel [T * pixels of a tile].
     """
 
     transmittance: Float
     last: UInt32
-    records: list[Float]
+    records: list[Float]  #: of `list_records`, of the events
+    capacity: int  #: Gaussians
 
 
 @dataclass
@@ -214,8 +215,8 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     """What each receiver has lost; one thread holds a block of a tile's pixels."""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
-    receives = dr.select(dr.arange(ad.UInt32, 2 * capacity) < capacity, ad.Float(1), ad.Float(0))
-    records = list_records(events, [receives], lists, round_capacity(2 * capacity))
+    records = list_records(pack_records(events, [], 2 * capacity), 2 * capacity, lists)
+    receivers = dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text, as in `make_events`
     threads, thread = lists.tiles_x * lists.tiles_y * shape.threads, thread_pixels(lists)
     inside = [_inside(thread, offset, image_size) for offset in thread_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
@@ -249,9 +250,10 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
 
     def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
         listed = [k + u < end if u else ad.Bool(True) for u in range(turn)]
-        loaded = [load(records, k + u, lists.capacity, listed[u]) for u in range(turn)]
+        numbers = [dr.gather(ad.UInt32, lists.splat, k + u, listed[u]) for u in range(turn)]
+        loaded = [load_listed(records, 2 * capacity, lists, k + u, listed[u]) for u in range(turn)]
         for u, record in enumerate(loaded):
-            powers, receiver = exponents(record, thread.x, thread.y, shape), record[6] > 0
+            powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < receivers
             if branches:
                 state = k + u, powers, transmittance, last, listed[u]
                 transmittance, last = dr.if_stmt(state, receiver, note, block, mode="symbolic")
@@ -268,7 +270,8 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
     tape = None
     if adjoint:
-        tape = _WalkTape(store(transmittance, thread.place, threads), store(last, thread.place, threads), records)
+        left, past = (store(of_pixels, thread.place, threads) for of_pixels in (transmittance, last))
+        tape = _WalkTape(left, past, records, capacity)
     dr.eval(slots, tape)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
@@ -317,17 +320,16 @@ def _replay(
     dr.eval(shares)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
     mode = reduce_mode(32 * lists.capacity, shape)
-    start = dr.gather(ad.UInt32, lists.start, thread.tile)
+    start, receivers = dr.gather(ad.UInt32, lists.start, thread.tile), dr.opaque(ad.UInt32, tape.capacity)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
 
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
-        record = load(tape.records, k, lists.capacity)
-        powers = exponents(record, thread.x, thread.y, shape)
-        receiver = record[6] > 0
         event = dr.gather(ad.UInt32, lists.splat, k)
+        record, receiver = load_listed(tape.records, 2 * tape.capacity, lists, k), event < receivers
+        powers = exponents(record, thread.x, thread.y, shape)
         share = dr.gather(ad.Float, shares, event, receiver)
         occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
         transmittance, behind = list(transmittance), list(behind)

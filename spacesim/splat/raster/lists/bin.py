@@ -277,7 +277,8 @@ def _count(
     key = dr.gather(ad.UInt32, footprints.order, splat)
     first_slot, slot_count = ad.UInt32(ends) - boxes.count, dr.select(fits, boxes.count, 0)
     splat, slot, start, end = ordered_lists(tile, key, splat, grid.tiles, capacity)
-    return TileLists(splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape)
+    size = grid.columns, grid.rows, grid.shape
+    return TileLists(splat, slot, start, end, first_slot, slot_count, capacity, *size, tile=tile)
 
 
 @recorded

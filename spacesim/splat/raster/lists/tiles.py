@@ -63,6 +63,8 @@ class TileLists:
     order: UInt32 | None = None
     #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
     place: UInt32 | None = None
+    #: the tile of each slot's pair [P], the number of tiles where it is in no list, or None: sums of such pairs are 0
+    tile: UInt32 | None = None
 
     def sum_index(self, k: UInt32, active: Bool | bool = True) -> UInt32:
         """Where the sums of pair k of `splat` are kept while they are added up.
@@ -74,6 +76,12 @@ class TileLists:
     def sum_of_slot(self, slot: UInt32) -> UInt32:
         """The same of a slot."""
         return slot if self.place is None else dr.gather(ad.UInt32, self.place, slot)
+
+    def has_sum(self, slot: UInt32, active: Bool) -> Bool:
+        """Whether there is a sum of a slot's pair; false where not `active`."""
+        if self.tile is None:
+            return active
+        return active & (dr.gather(ad.UInt32, self.tile, slot, active) < self.tiles_x * self.tiles_y)
 
     @property
     def pairs(self) -> int:

@@ -16,7 +16,7 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 
 RADIUS = 5  #: 11 x 11 window
 SIGMA = 1.5  #: pixels
-COLUMNS = 8  #: pixels of a row that a thread computes
+COLUMNS = {"cuda": 4, "llvm": 8}  #: pixels of a row that a thread computes
 ROWS = 16  #: pixels of a column that a thread computes
 #: backends on which the moments of a pixel stand side by side, elsewhere in planes: two cores take 1.3 times as long
 #: with planes, an H100 1.25 times as long with packets
@@ -86,7 +86,7 @@ def _moments(strips: "_Strips", pairs: list[tuple[Float, Float]]) -> tuple[list[
     moments, distances = [dr.empty(ad.Float, numbers * size) for _ in range(4 // numbers)], ad.Float(0)
     for channel, pair in enumerate(pairs):
         xs, ys = (strips.read_row(plane, row, strip, RADIUS) for plane in pair)
-        for j in range(RADIUS, RADIUS + COLUMNS):
+        for j in range(RADIUS, RADIUS + strips.columns):
             distances += dr.abs(xs[j] - ys[j])
         squares = [dr.fma(x, x, y * y) for x, y in zip(xs, ys, strict=True)]
         products = [x * y for x, y in zip(xs, ys, strict=True)]
@@ -145,7 +145,7 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 
 
 class _Strips:
-    """Where pixels stand in memory. Threads hold COLUMNS pixels of a row or ROWS of a column.
+    """Where pixels stand in memory. Threads hold some `columns` of a row or ROWS of a column.
 
     Pictures and partials are planes, of one channel and of three; so are moments, or they stand by pixels, four each
     (`PACKED`). Rows are as long as their strips; beyond the picture, pictures and partials are 0.
@@ -155,8 +155,9 @@ class _Strips:
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
-        self.across, self.down = -(-width // COLUMNS), -(-height // ROWS)
-        self.stride = self.across * COLUMNS
+        self.columns = COLUMNS[select()]
+        self.across, self.down = -(-width // self.columns), -(-height // ROWS)
+        self.stride = self.across * self.columns
 
     def padded(self, plane: Float) -> Float:
         """A plane [height * width] as one [height * stride], 0 beyond the picture."""
@@ -175,10 +176,10 @@ class _Strips:
 
     def read_row(self, plane: Float, row: UInt32, strip: UInt32, halo: int) -> list[Float]:
         """A strip's pixels and `halo` to either side, 0 beyond the row's ends."""
-        beside, values = -(-halo // COLUMNS), list[Float]()
+        beside, values = -(-halo // self.columns), list[Float]()
         for place, inside in _neighbours(strip, range(-beside, beside + 1), self.across):
-            values += _read(plane, COLUMNS, row * self.across + place, inside)
-        spare = beside * COLUMNS - halo
+            values += _read(plane, self.columns, row * self.across + place, inside)
+        spare = beside * self.columns - halo
         return values[spare : len(values) - spare]
 
     def read_moments(self, moments: list[Float], channel: UInt32, first: UInt32, column: UInt32) -> list[list[Float]]:
