@@ -481,6 +481,29 @@ def test_numbers_are_read_without_synchronising():
         assert (short.wait(), last.wait(), first.wait()) == (961, 2**40 + (999 + turn) ** 2, 2**40 + 9)
 
 
+@pytest.mark.parametrize("library", ["there", "missing", "there, arrays too large"])
+def test_arrays_are_read_without_synchronising(monkeypatch, library):
+    import drjit as dr
+
+    from spacesim.backend import readback
+
+    if library == "missing":
+        monkeypatch.setattr(readback, "can_read_async", lambda: False)
+    if library == "there, arrays too large":
+        monkeypatch.setattr(readback, "MAX_BYTES", 3)
+    ad = backend.ad
+    for size in (1, 1000, 1000, 1001):
+        ints, floats = dr.square(dr.arange(ad.UInt32, size)), 0.5 * dr.arange(ad.Float, size)
+        dr.eval(ints, floats)
+        reads = readback.AsyncArray(ints), readback.AsyncArray(floats)
+        del ints, floats
+        wide, halves = (read.wait() for read in reads)
+        assert (wide.dtype, halves.dtype) == (np.uint32, np.float32)
+        np.testing.assert_array_equal(wide, np.arange(size, dtype=np.uint32) ** 2)
+        np.testing.assert_array_equal(halves, np.arange(size) / 2)
+        wide[:] = 7  # memory of its own
+
+
 @pytest.mark.gpu
 def test_a_number_is_read_before_later_work_ends():
     if backend.select() != "cuda":

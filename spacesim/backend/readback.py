@@ -1,22 +1,24 @@
-"""Numbers of the device's that the host reads without a wait for all that the device was asked for since.
+"""Arrays of the device's that the host reads without a wait for all that the device was asked for since.
 
-To read an array synchronises with the device. Here the device copies an entry to memory of the host's as soon as the
-array is there, and an event says when. Dr.Jit has the events for Python, the copy in C++ alone: `can_read_async` says
+To read an array synchronises with the device. Here the device copies it, or an entry, to memory of the host's as soon
+as it is there, and an event says when. Dr.Jit has the events for Python, the copy in C++ alone: `can_read_async` says
 whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS.
 """
 
 import ctypes
 import importlib
 import threading
-from ctypes import c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from ctypes import c_int, c_size_t, c_uint32, c_void_p
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from spacesim.backend.arrays import UInt32, UInt64
+import numpy as np
+
+from spacesim.backend.arrays import Float, UInt32, UInt64
 from spacesim.backend.selection import load_drjit, select
 
-_BYTES = 8  # of an entry, at most
+MAX_BYTES = 2**26  #: of an array that is copied on its own: such memory of the host's is kept
 _LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
 _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
@@ -38,27 +40,56 @@ class AsyncNumber:
 
     def __init__(self, array: UInt32 | UInt64, index: int) -> None:
         """Raises RuntimeError where `can_read_async` is false."""
+        self._copy = _Copy(array, index, 1)
+
+    def wait(self) -> int:
+        """The number. Waits for what was asked of the device before this was made, and for nothing else."""
+        return int(self._copy.wait()[0])
+
+
+class AsyncArray:
+    """An evaluated array Float or UInt32 [N], read once with `wait`, by the thread that made it. Where `can_read_async`
+    is false, or the array takes more than `MAX_BYTES`, that waits for all that the device was asked for."""
+
+    def __init__(self, array: Float | UInt32) -> None:
+        count = load_drjit().width(array)
+        copies = can_read_async() and 0 < 4 * count <= MAX_BYTES
+        self._array, self._copy = None if copies else array, _Copy(array, 0, count) if copies else None
+
+    def wait(self) -> np.ndarray:
+        """[N], memory of its own. Waits for what was asked of the device before this was made, and for nothing else."""
+        if self._copy is not None:
+            return self._copy.wait()
+        assert self._array is not None
+        return np.array(self._array)
+
+
+class _Copy:
+    """`count` entries of an array, from the `first` on, on their way to the host."""
+
+    def __init__(self, array: Any, first: int, count: int) -> None:
         functions = _functions()
         if functions is None:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
         dr = load_drjit()
-        backend = dr.backend_v(array).value
-        self._number: Any = c_uint64 if dr.itemsize_v(array) == _BYTES else c_uint32
-        size = ctypes.sizeof(self._number)
-        free = _local.free
-        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, _BYTES, _SHARED))
+        backend, size = dr.backend_v(array).value, dr.itemsize_v(array)
+        self._type, self._count = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), count
+        free = _local.free.setdefault(size * count, [])
+        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, size * count, _SHARED))
         start = c_void_p()
         variable = functions["address"](array.index, ctypes.byref(start))
-        functions["copy"](backend, self._slot.address, (start.value or 0) + size * index, size)
+        functions["copy"](backend, self._slot.address, (start.value or 0) + size * first, size * count)
         functions["release"](variable)
         self._slot.record(functions)
 
-    def wait(self) -> int:
-        """The number. Waits for what was asked of the device before this was made, and for nothing else."""
+    def wait(self) -> np.ndarray:
+        """[count], once."""
         self._slot.event.wait()
-        number = self._number.from_address(self._slot.address).value
-        _local.free.append(self._slot)
-        return number
+        size = self._type.itemsize * self._count
+        memory: Any = (ctypes.c_char * size).from_address(self._slot.address)
+        entries: np.ndarray = np.frombuffer(memory, self._type).copy()
+        _local.free[size].append(self._slot)
+        return entries
 
 
 def can_read_async() -> bool:
@@ -67,7 +98,7 @@ def can_read_async() -> bool:
 
 
 class _HostSlot:
-    """Memory of the host's for one entry, and an event. Never given back: slots are few, and used again."""
+    """Memory of the host's, and an event. Never given back: slots are few, and used again."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -87,10 +118,10 @@ class _HostSlot:
 
 
 class _FreeSlots(threading.local):
-    """Of a thread, whose stream the events belong to."""
+    """Of a thread, whose stream the events belong to, by bytes."""
 
     def __init__(self) -> None:
-        self.free: list[_HostSlot] = []
+        self.free: dict[int, list[_HostSlot]] = {}
 
 
 _local = _FreeSlots()

@@ -4,10 +4,10 @@ All surface points that face the Sun are asked for a few directions to its disc.
 on the pixels next to these, many directions are; as long as that finds more of a penumbra, next to it too.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -15,12 +15,13 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.readback import AsyncArray
 from spacesim.backend.upload import upload
 from spacesim.data.files import JsonMapping
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW_SELF_CAST
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, record_on_cuda
-from spacesim.scenes.lights.emitters import kernel_input
+from spacesim.scenes.lights.emitters import Limb, kernel_input
 from spacesim.scenes.scene import MitsubaScene, Scene
 from spacesim.scenes.visibility import Disc, SolarDirections
 
@@ -29,6 +30,11 @@ OFFSET = 2e-6 * RADIUS
 
 MAX_RAYS = 1 << 24
 """Most shadow rays at once."""
+
+
+T = TypeVar("T")
+Steps = Generator[None, None, T]
+"""Work that stops where it waits for the device, with that at work, and gives a T in the end."""
 
 
 class Labeller:
@@ -43,29 +49,33 @@ class Labeller:
         self._centres = record_on_cuda(partial(_trace_centres, tuple(distortion)))
         self._penumbrae = record_on_cuda(_trace_penumbrae)
 
-    def labels(self, camera: Camera, sun: Sun) -> dict[str, np.ndarray]:
+    def labels(self, camera: Camera, sun: Sun) -> Steps[dict[str, np.ndarray]]:
         """All fields of Truth but radiance and alpha."""
-        disc = self._directions.few(sun, self._sun.limb)
-        seen = KernelCamera.of(camera, self._units)
+        limb = self._sun.limb
+        disc, seen = self._directions.few(sun, limb), KernelCamera.of(camera, self._units)
         numbers, ids, points = self._centres(self._scene, self._parts, seen, kernel_input(sun.direction), disc)
-        labels = _images(numbers, ids, camera)
-        self._refine(points, sun, labels)
+        reads = AsyncArray(numbers), AsyncArray(ids)
+        yield
+        labels = _images(reads[0].wait(), reads[1].wait(), camera)
+        yield from self._refine(points, sun, limb, labels)
         return labels
 
-    def _refine(self, points: "_Points", sun: Sun, labels: Mapping[str, np.ndarray]) -> None:
+    def _refine(self, points: "_Points", sun: Sun, limb: Limb | None, labels: Mapping[str, np.ndarray]) -> Steps[None]:
         """Settle penumbrae in the labels sun_visibility and shadow."""
         visibility, shadow, cosine = (labels[name].reshape(-1) for name in ("sun_visibility", "shadow", "sun_cosine"))
         mixed = np.flatnonzero((visibility > 0) & (visibility < 1))
-        disc = self._directions.many(sun, self._sun.limb) if len(mixed) else None
+        disc = self._directions.many(sun, limb) if len(mixed) else None
         settled = np.zeros(len(cosine), bool)
         while disc is not None and len(mixed):
             todo = _dilate(mixed, labels["shadow"].shape)
             todo = todo[(cosine[todo] > 0) & ~settled[todo]]
-            visibility[todo], shadow[todo] = self._query_penumbrae(disc, points, todo)
+            visibility[todo], shadow[todo] = yield from self._query_penumbrae(disc, points, todo)
             settled[todo] = True
             mixed = todo[(visibility[todo] > 0) & (visibility[todo] < 1)]
 
-    def _query_penumbrae(self, disc: Disc, points: "_Points", indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _query_penumbrae(
+        self, disc: Disc, points: "_Points", indices: np.ndarray
+    ) -> Steps[tuple[np.ndarray, np.ndarray]]:
         """(visibility, shadow classes), [N], of the points `indices` [N]."""
         uint = backend.mitsuba().UInt32
         most = max(1, MAX_RAYS // disc.count)
@@ -76,8 +86,9 @@ class Labeller:
             padded = np.zeros(capacity, np.uint32)
             padded[: len(piece)] = piece
             count = dr.opaque(uint, len(piece))
-            values = self._penumbrae(self._scene, self._parts, disc, points, uint(padded), count, capacity)
-            pieces.append(values.numpy().reshape(2, -1)[:, : len(piece)])
+            values = AsyncArray(self._penumbrae(self._scene, self._parts, disc, points, uint(padded), count, capacity))
+            yield
+            pieces.append(values.wait().reshape(2, -1)[:, : len(piece)])
         visibility, shadow = np.concatenate(pieces, axis=1)
         return visibility, shadow.astype(np.uint8)
 
@@ -216,17 +227,14 @@ def _has_color_image(bsdf: JsonMapping) -> bool:
     return any(_has_color_image(value) for value in bsdf.values() if isinstance(value, Mapping))
 
 
-def _images(numbers: Float, ids: UInt32, camera: Camera) -> dict[str, np.ndarray]:
-    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `Labeller._trace_centres` returns.
-
-    Copies: arrays over Dr.Jit's memory that another thread lets go of can stop the whole process for good.
-    """
+def _images(numbers: np.ndarray, ids: np.ndarray, camera: Camera) -> dict[str, np.ndarray]:
+    """Labels as [H, W] or [H, W, 3], float32 or uint8, from what `_trace_centres` returns."""
     shape = camera.height, camera.width
-    planes = np.split(numbers.numpy().copy().reshape(-1, camera.height * camera.width), [1, 2, 3, 6, 9])
+    planes = np.split(numbers.reshape(-1, camera.height * camera.width), [1, 2, 3, 6, 9])
     names = "depth", "distance", "sun_cosine", "normal", "albedo", "sun_visibility"
     labels = {
         name: plane.reshape(shape if len(plane) == 1 else (*shape, 3))
         for name, plane in zip(names, planes, strict=True)
     }
-    packed = ids.numpy().view(np.uint8).reshape(*shape, 4)
+    packed = ids.view(np.uint8).reshape(*shape, 4)
     return {**labels, **{name: packed[..., i].copy() for i, name in enumerate(("object_id", "part_id", "shadow"))}}

@@ -19,10 +19,11 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.readback import AsyncArray
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
-from spacesim.scenes.labels import OFFSET, Labeller
+from spacesim.scenes.labels import OFFSET, Labeller, Steps, T
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene, load
 
@@ -46,6 +47,16 @@ def _check_memory(camera: Camera, spp: int) -> None:
     pixels = camera.width * camera.height
     needed = A_PIXEL * pixels + A_SAMPLE * min(spp * pixels, MAX_WAVEFRONT)
     backend.check_free_memory(needed, f"path tracing {camera.width} x {camera.height} pixels")
+
+
+def completed(steps: Steps[T]) -> T:
+    """What they give in the end."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
 
 class Renderer:
@@ -78,13 +89,22 @@ class Renderer:
     ) -> Truth:
         """What `camera` sees under `sun` by `spp` samples a pixel; `seed` makes the noise. earth: where the scene's
         Earth is; None: where the scene says."""
+        return completed(self.rendering(camera, sun, seed, spp, earth))
+
+    def rendering(
+        self, camera: Camera, sun: Sun, seed: Sequence[int], spp: int | None = None, earth: EarthConfig | None = None
+    ) -> Steps[Truth]:
+        """`render` in steps: while others are done, the device traces this one's paths."""
         spp = spp or self.spp
         _check_memory(camera, spp)
         self._point(sun, earth)
+        labelling = self._labeller.labels(camera, sun)
+        next(labelling)  # read while the device traces paths
         sunlight = self._launch_passes(self._loaded.sunlit, camera, seed, spp)
         earthlit = self._loaded.earthlit
         earthlight = self._launch_passes(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
-        labels = self._labeller.labels(camera, sun)  # while the device traces paths
+        yield
+        labels = yield from labelling
         radiance, alpha = _mean_radiance(sunlight, camera, spp)
         if earthlight is None:
             return Truth(radiance=radiance, alpha=alpha, **labels)
@@ -112,18 +132,16 @@ class Renderer:
     def labels(self, camera: Camera, sun: Sun, earth: EarthConfig | None = None) -> dict[str, np.ndarray]:
         """All fields of what `render` returns but radiance and alpha, which take no paths. earth: as in `render`."""
         self._point(sun, earth)
-        return self._labeller.labels(camera, sun)
+        return completed(self._labeller.labels(camera, sun))
 
-    def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[Float]:
+    def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[AsyncArray]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint, view = backend.mitsuba().UInt32, KernelCamera.of(camera, self._loaded.units)
         passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
         firsts = [spp * i // passes for i in range(passes + 1)]
-        return [
-            self._sums(scene, view, _Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])), firsts[i + 1] - firsts[i])
-            for i in range(passes)
-        ]
+        noise = [_Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])) for i in range(passes)]
+        return [AsyncArray(self._sums(scene, view, noise[i], firsts[i + 1] - firsts[i])) for i in range(passes)]
 
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
@@ -186,9 +204,9 @@ def _trace_paths(
     return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
 
 
-def _mean_radiance(sums: Sequence[Float], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
+def _mean_radiance(sums: Sequence[AsyncArray], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
-    total: np.ndarray = sum(values.numpy() for values in sums) / np.float32(spp)
+    total: np.ndarray = sum(values.wait() for values in sums) / np.float32(spp)
     shape = camera.height, camera.width
     return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 

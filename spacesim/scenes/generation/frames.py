@@ -9,9 +9,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
+from spacesim.backend import select
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter
@@ -22,11 +24,15 @@ from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
 from spacesim.scenes.generation.moves import as_moved
+from spacesim.scenes.labels import Steps
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 from spacesim.version import __version__
 
+AT_ONCE = {"cuda": 4, "llvm": 1}
+"""Frames under way beside the newest: the device traces paths of one while the host reads others. On a CPU the host
+has no time of its own."""
 MAX_THREADS = 16
 IN_FLIGHT = 1 << 30
 """Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
@@ -109,6 +115,34 @@ def shadow_under(visibility: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     return np.where(hidden, np.uint8(SHADOW_SELF_CAST), shadow)
 
 
+class _FrameUnderWay:
+    """A frame whose first step is taken."""
+
+    def __init__(self, spec: FrameSpec, steps: Steps[Truth | None]) -> None:
+        self.is_done, self.error = False, cast("Exception | None", None)
+        self._spec, self._steps, self._truth = spec, steps, cast("Truth | None", None)
+        self.advance()
+
+    def advance(self) -> None:
+        """By a step, if there is one left."""
+        if self.is_done:
+            return
+        try:
+            next(self._steps)
+        except StopIteration as end:
+            self.is_done, self._truth = True, end.value
+        except Exception as error:
+            self.is_done, self.error = True, error
+
+    def finish(self) -> tuple[FrameSpec, Truth | None]:
+        """The frame, with all its steps taken. Raises the error that one of them met."""
+        while not self.is_done:
+            self.advance()
+        if self.error is not None:
+            raise self.error
+        return self._spec, self._truth
+
+
 class FrameMaker:
     """Renders and writes the frames of a job; loads its scene once. renderer: that of the scene, where there is one."""
 
@@ -132,26 +166,46 @@ class FrameMaker:
         waiting: deque[Future[str]] = deque()
         with ThreadPoolExecutor(self._job.threads, "write") as pool:
             try:
-                for spec in specs:
-                    if self._writer.has_frame(spec.name):
-                        yield spec.name
-                        continue
+                for spec, truth in self._rendered(specs):
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
-                    seed = (self._job.seed, spec.index)
-                    renderer = as_moved(self._renderer, spec.objects)
-                    truth = renderer.render(spec.camera, spec.sun, seed, spec.spp, spec.earth)
-                    truth = dim(truth, spec.sunlight)
-                    if self._background is not None:
-                        behind = self._background.radiance(
-                            spec.camera, spec.sun, spec.index, spec.earth, spec.sky_from_world
-                        )
-                        truth = replace(truth, radiance_background=behind)
-                    waiting.append(pool.submit(self._write, spec, truth))
+                    if truth is None:
+                        waiting.append(Future())
+                        waiting[-1].set_result(spec.name)
+                    else:
+                        waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:
                     yield waiting.popleft().result()
             finally:
                 pool.shutdown(cancel_futures=True)
+
+    def _rendered(self, specs: Sequence[FrameSpec]) -> Iterator[tuple[FrameSpec, Truth | None]]:
+        """Frames with their truth, None of those that are whole on disk, in order; some are under way at once. The
+        first error comes after the frames before it."""
+        under_way: deque[_FrameUnderWay] = deque()
+        for spec in specs:
+            under_way.append(_FrameUnderWay(spec, self._steps(spec)))
+            for frame in list(under_way)[:-1]:
+                frame.advance()
+            if any(frame.error for frame in under_way):
+                break
+            while under_way and (len(under_way) > AT_ONCE[select()] or under_way[0].is_done):
+                yield under_way.popleft().finish()
+        for frame in under_way:
+            yield frame.finish()
+
+    def _steps(self, spec: FrameSpec) -> Steps[Truth | None]:
+        """Of a frame's truth."""
+        if self._writer.has_frame(spec.name):
+            return None
+        seed = (self._job.seed, spec.index)
+        renderer = as_moved(self._renderer, spec.objects)
+        truth = yield from renderer.rendering(spec.camera, spec.sun, seed, spec.spp, spec.earth)
+        truth = dim(truth, spec.sunlight)
+        if self._background is None:
+            return truth
+        behind = self._background.radiance(spec.camera, spec.sun, spec.index, spec.earth, spec.sky_from_world)
+        return replace(truth, radiance_background=behind)
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
         seed, behind = (self._job.seed, spec.index), truth.radiance_background

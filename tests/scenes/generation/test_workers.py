@@ -15,7 +15,7 @@ from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.scenes import generate, read_scene
-from spacesim.scenes.generation import workers
+from spacesim.scenes.generation import frames, workers
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writing_threads
 from spacesim.scenes.generation.generate import _DatasetPlan
 from spacesim.scenes.generation.workers import make_in_processes
@@ -126,6 +126,39 @@ def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
     assert list(maker.make(specs)) == [spec.name for spec in specs]
     monkeypatch.setattr(maker, "_renderer", None)
     assert list(maker.make(specs)) == [spec.name for spec in specs]
+
+
+@pytest.mark.parametrize("at_once", [0, 1, 3])
+def test_frames_are_the_same_however_many_are_under_way(job, tmp_path, monkeypatch, at_once):
+    """Some of them whole already."""
+    work, specs = job
+    one = replace(work, root=tmp_path / "one")
+    assert list(FrameMaker(one).make(specs)) == [spec.name for spec in specs]
+    monkeypatch.setattr(frames, "AT_ONCE", dict.fromkeys(frames.AT_ONCE, at_once))
+    again = FrameMaker(replace(work, root=tmp_path / "again"))
+    assert list(again.make(specs[1:3])) == [spec.name for spec in specs[1:3]]
+    assert list(again.make(specs)) == [spec.name for spec in specs]
+    assert contents(tmp_path / "again") == contents(one.root)
+
+
+@pytest.mark.parametrize("step", [0, 1])
+def test_an_error_comes_after_the_frames_before_it(job, monkeypatch, step):
+    """In a frame's first step, or while later ones have been started."""
+    work, specs = job
+    monkeypatch.setattr(frames, "AT_ONCE", dict.fromkeys(frames.AT_ONCE, 3))
+    maker, whole = FrameMaker(work), FrameMaker._steps
+
+    def failing(self, spec):
+        if spec.index != 2:
+            return (yield from whole(self, spec))
+        yield from [None] * step
+        raise WorkError("no memory is left")
+
+    monkeypatch.setattr(FrameMaker, "_steps", failing)
+    made = []
+    with pytest.raises(WorkError, match="no memory is left"):
+        made.extend(spec.index for spec, _ in maker._rendered(specs))
+    assert made == [0, 1]
 
 
 class _Obliging:
