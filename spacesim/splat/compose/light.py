@@ -2,7 +2,8 @@
 
 Each run's colours, and the shadows that it casts on itself, are computed in its own frame, with camera and Sun brought
 into it: harmonics turn with the model, fields and refinement see the directions, places and lengths that they were
-trained with. Shadows that other models cast on it (4.15) are computed there, too, and multiply its colours (4.16).
+trained with. Shadows that other models cast on it (4.15) are computed there, too, and multiply its colours (4.16), but
+for light that bounces, which comes from where they leave sunlight.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -21,6 +22,7 @@ from spacesim.data.records import Camera, Sun
 from spacesim.splat.compose.members import Ensemble
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.light.shadow.cast import CrossShadow, cast_cross_shadows
+from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Pinhole
 
 MIN_SCALE_SHARE = 0.25  #: least light pixels over a model's extent as a share of the picture's size: half of training's
@@ -98,19 +100,24 @@ class EnsembleLight:
         member, pose = self.ensemble.members[k], self.poses[k]
         near, towards = pose.camera_in_model(camera), None if self.sun is None else pose.direction_in_model(self.sun)
         direction = b"" if towards is None else towards.tobytes()
-        sunlight = self.cache.get(("sunlight", k), direction, lambda: member.sunlight(towards))
+        arrives = direction, None if share is None else self._key_between
+        sunlight = self.cache.get(("sunlight", k), arrives, lambda: self._arriving(k, towards, direction, share))
         earth = pose.earth_in_model(self.earth) if member.run.light else None
-        alone = None if earth is None else share  # where the Earth shines, too, sunlight alone is dimmed
-        key = near.world_from_camera.tobytes(), direction, earth, None if alone is None else self._key_between
-
-        def compute() -> Light:
-            linear = member.curve is not None
-            arriving = sunlight if sunlight is None or alone is None else sunlight.dimmed(alone, linear)
-            return member.shade(Pinhole.of(near), towards, arriving, earth)
-
-        part = self.cache.get(("light", k), key, compute)
-        colors, visibility = _dim(part, share) if alone is None else part
+        key = near.world_from_camera.tobytes(), arrives, earth
+        colors, visibility = self.cache.get(
+            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight, earth)
+        )
+        if sunlight is None and share is not None:
+            colors = [color * share for color in colors]  # 4.16
         return colors, visibility if member.run.has_shadows else self._past_earth(share, member.count)
+
+    def _arriving(self, k: int, towards: Array | None, direction: bytes, share: Float | None) -> Sunlight | None:
+        """At member k, as `_lit` takes the share."""
+        member = self.ensemble.members[k]
+        if share is None:
+            return member.sunlight(towards)
+        own = self.cache.get(("visibility", k), direction, lambda: member.visibility(towards))
+        return member.arriving(towards, share if own is None else own * share)
 
     def _past_earth(self, share: Float | None, count: int) -> Float | None:
         """The share of sunlight that reaches a member without shadows of its own, as `_lit` takes it."""
@@ -156,11 +163,3 @@ class EnsembleLight:
             result.append(own if share is None else own * share)
         dr.eval(result)
         return result
-
-
-def _dim(part: Light, share: Float | None) -> Light:
-    """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
-    colors, visibility = part
-    if share is None:
-        return part
-    return [color * share for color in colors], share if visibility is None else visibility * share

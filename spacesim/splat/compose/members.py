@@ -84,10 +84,20 @@ class Member:
         """Of its linear colours, see `LightConfig.curve`; None where colours are sRGB values."""
         return self.run.light.config.curve if self.run.light else None
 
+    def visibility(self, sun: Array | None) -> Float | None:
+        """In its own shadows, [N]; None for a run without any. sun: [3] in the model's frame"""
+        light = self.run.light
+        return None if light is None else light.visibility(self.run.gaussians, sun)
+
     def sunlight(self, sun: Array | None) -> Sunlight | None:
-        """In its own shadows; None for a run without light. sun: [3] in the model's frame"""
+        """Of that visibility; None for a run without light."""
         light = self.run.light
         return None if light is None else light.sunlight(self.run.gaussians, sun)
+
+    def arriving(self, sun: Array | None, visibility: Float) -> Sunlight | None:
+        """Of another visibility, [N]; None for a run without light."""
+        light = self.run.light
+        return None if light is None else light.arriving(self.run.gaussians, sun, visibility)
 
     def shade(
         self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None, earth: Earth | None = None

@@ -45,8 +45,9 @@ def bake(
     colors = np.empty((VIEWS, 3, gaussians.count), np.float32)
     weights = np.empty((VIEWS, gaussians.count), np.float32)
     sunlight = light.sunlight(gaussians, sun)  # from all around the same
-    if earth is not None and others is not None:
-        sunlight, others = sunlight.dimmed(others, light.config.curve is not None), None
+    if others is not None:
+        own = sunlight.visibility
+        sunlight = light.arriving(gaussians, sun, others if own is None else own * others)
     arrays = gaussians.to_numpy()
     centre = np.median(arrays["means"].astype(np.float64), axis=0)
     away = np.linalg.norm(arrays["means"] - centre, axis=1)
@@ -56,8 +57,6 @@ def bake(
         pose = look_at(centre - 2 * radius * direction, centre)
         camera = Orthographic.of(OrthographicCamera.from_extent(pose, PIXELS, PIXELS, 2 * radius))
         shown, _ = light.shade_picture(gaussians, camera, sun, sunlight=sunlight, earth=earth)
-        if others is not None:
-            shown = [color * others for color in shown]
         if light.config.curve:
             shown = [tone_map(color, light.config.curve.tone, light.config.curve.white) for color in shown]
         colors[view] = [np.array(color) for color in shown]

@@ -130,8 +130,8 @@ def emission(
 
 
 def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, gaussians: UInt32) -> list[Float]:
-    """rho_k v_k |n_k . s| of the Gaussians k, [count], three Floats. visibility: [M] in a list, or nothing for 1;
-    gaussians: N"""
+    """rho_k v_k |n_k . s| of the Gaussians k, [count], three Floats. visibility: of each Gaussian in a list, or
+    nothing for 1;  gaussians: N"""
     seen = dr.dot(lit_normals(scatterers, k, gaussians), scatterers.sun)
     if visibility:
         seen *= dr.gather(ad.Float, visibility[0], k)

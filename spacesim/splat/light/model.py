@@ -250,27 +250,45 @@ class LightModel:
         read = [*gaussians.rows(), *self.weights, *self.embeddings]
         asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
         last = self._last_sunlight
+
+        def compute(make_lists: MakeLists = bin_splats) -> Sunlight:
+            return self.arriving(gaussians, sun, self._visibility(gaussians, sun, make_lists), embedding)
+
         if dr.grad_enabled(read):
-            return self._sunlight(gaussians, sun, embedding)
+            return compute()
         if asked != last.asked or not _are_same(read, last.read):
-            sunlight = computed(lambda make_lists: self._sunlight(gaussians, sun, embedding, make_lists))
-            last = self._last_sunlight = _LastSunlight(_kept(read), asked, sunlight)
+            last = self._last_sunlight = _LastSunlight(_kept(read), asked, computed(compute))
         return last.sunlight
 
-    def _sunlight(
+    def visibility(self, gaussians: Gaussians, sun: np.ndarray | None) -> Float | None:
+        """Of `sunlight`, without what bounces."""
+        return computed(lambda make_lists: self._visibility(gaussians, sun, make_lists))
+
+    def _visibility(self, gaussians: Gaussians, sun: np.ndarray | None, make_lists: MakeLists) -> Float | None:
+        shadows = self.shadows(gaussians, sun, make_lists)
+        if shadows is None:
+            return None
+        inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows, None)
+        batch = PaddedBatch.of(gaussians.count, still=True)
+        return kernels.refined_visibility(self.config, self.weights, inputs, batch)
+
+    def arriving(
         self,
         gaussians: Gaussians,
         sun: np.ndarray | None,
-        embedding: np.ndarray | None,
-        make_lists: MakeLists = bin_splats,
+        visibility: Float | None,
+        embedding: np.ndarray | None = None,
     ) -> Sunlight:
-        shadows = self.shadows(gaussians, sun, make_lists)
-        batch = PaddedBatch.of(gaussians.count, still=True)
+        """`sunlight` of which so much arrives at each Gaussian, Float [N], None for all: what others shade scatters
+        none, too."""
+        if not self.config.bounce:
+            return Sunlight(visibility, [])
         of_picture = self._mean_embedding() if embedding is None else [upload(np.asarray(embedding, np.float64))]
         terms = self._with_embedding(self.encode_sun(sun), of_picture)
-        inputs = self._inputs(gaussians, None, terms, shadows, self.surroundings(gaussians))
-        visibility, bounced, emitted = kernels.cast_sunlight(self.config, self.weights, inputs, batch)
-        return Sunlight(visibility[0] if visibility else None, bounced, emitted)
+        inputs = self._inputs(gaussians, None, terms, None, self.surroundings(gaussians))
+        batch = PaddedBatch.of(gaussians.count, still=True)
+        shares = [] if visibility is None else [visibility]
+        return Sunlight(visibility, *kernels.scatter_sunlight(self.config, self.weights, inputs, batch, shares))
 
     def shade_picture(
         self,

@@ -134,8 +134,6 @@ def shade_picture(
     bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
     mirrored = _received(config, inputs, sunlight.emitted, batch, sides=False, mirrors=True)
     scattered = _scattered(config, inputs, bounced, mirrored, batch)
-    for share in sunlight.mirrored:
-        scattered[3:] = [light * batch.pad_zeros(share) for light in scattered[3:]]
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
     dr.eval(shown)
@@ -143,18 +141,25 @@ def shade_picture(
 
 
 @recorded
-def cast_sunlight(
-    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[list[Float], list[Float], list[Float]]:
-    """([refined visibility [N]] or [], light that bounces and what is emitted, see `Sunlight`)."""
-    field_weights, refine_weights = split_weights(config, weights)
-    visibility = [1 - value for value in _refine_occlusion(config, refine_weights, inputs, batch)[0]]
+def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
+    """Of the Sun, refined, [N]."""
+    _, refine_weights = split_weights(config, weights)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, batch)
+    visibility = 1 - occlusion[0]
     dr.eval(visibility)
+    return batch.unpad([visibility], inputs.means.x)[0]
+
+
+@recorded
+def scatter_sunlight(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visibility: list[Float]
+) -> tuple[list[Float], list[Float]]:
+    """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
+    field_weights, _ = split_weights(config, weights)
     emitted = _emitted(config, field_weights, inputs, visibility, batch)
     bounced = _received(config, inputs, emitted, batch, sides=True, mirrors=False)
     dr.eval(bounced)
-    shown = batch.unpad([*visibility, *bounced], inputs.means.x)
-    return shown[: len(visibility)], shown[len(visibility) :], emitted if config.mirrors else []
+    return batch.unpad(bounced, inputs.means.x), emitted if config.mirrors else []
 
 
 @recorded
@@ -306,7 +311,8 @@ def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch
 def _emitted(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, visibility: list[Float], batch: PaddedBatch
 ) -> list[Float]:
-    """What `emission` gives, or nothing. weights: of the field"""
+    """What `emission` gives, or nothing. weights: of the field;  visibility: of each Gaussian in a list, or nothing
+    for 1"""
     surroundings = inputs.surroundings
     if surroundings is None:
         return []
@@ -346,7 +352,7 @@ def _painted(
     each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the
     Sun.
 
-    weights: of the field;  visibility: [M] in a list, or nothing for 1
+    weights: of the field;  visibility: as in `_emitted`
     """
     field, count = config.field, config.bounce
     columns = PaddedBatch(gaussians, -(-SIDES * count // CHUNK) * CHUNK)

@@ -7,7 +7,6 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.learning.reflectance import past_earth
-from spacesim.splat.raster.tone import decode_srgb
 
 
 @dataclass
@@ -39,11 +38,3 @@ class Sunlight:
     bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
     #: of `bounce.emission`, where surfaces mirror it, or nothing
     emitted: list[Float] = field(default_factory=list)
-    mirrored: list[Float] = field(default_factory=list)  #: what is left of that, a share [N] in a list, or nothing
-
-    def dimmed(self, share: Float, linear: bool) -> "Sunlight":
-        """The share of it, Float [N], that others let through. linear: of the colours, see `LightConfig`"""
-        visibility = share if self.visibility is None else self.visibility * share
-        of_light = share if linear else decode_srgb(share)  # colours are multiplied by the share as they are (4.16)
-        mirrored = [left * of_light for left in self.mirrored] or [of_light]
-        return Sunlight(visibility, [light * of_light for light in self.bounced], self.emitted, mirrored)

@@ -78,7 +78,7 @@ def test_it_reaches_into_shadows_of_others(run, shadows):
     earth = light_of(alone, BOTH) - light_of(alone, SUN)
     facing = Pose(rotation_about(np.cross([0, 0, 1], SUN.direction), 55), 50 * SUN.direction)
     behind = GaussianComposition([PlacedRun(run), PlacedRun(disc_run(3.0), facing)])
-    assert light_of(behind, SUN).max() < 1e-3
+    assert light_of(behind, SUN).max() < 3e-3  # an opaque one lets through 1/1000 of sunlight, which bounces, too
     assert earth.max() > 0.05
     np.testing.assert_allclose(light_of(behind, BOTH), earth, atol=2e-3)
     shown = behind.predict(EYE, BOTH)

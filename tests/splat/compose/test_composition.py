@@ -409,13 +409,13 @@ def test_only_what_is_asked_for_is_computed(monkeypatch):
 def test_unchanged_visibility_is_not_computed_again(monkeypatch):
     """A camera that moves leaves all visibility; a model that moves with the world's Sun, that of the others."""
     asked = []
-    sunlight = LightModel.sunlight
+    shadows = LightModel.shadows
 
     def counted(self, *arguments, **named):
         asked.append(self)
-        return sunlight(self, *arguments, **named)
+        return shadows(self, *arguments, **named)
 
-    monkeypatch.setattr(LightModel, "sunlight", counted)
+    monkeypatch.setattr(LightModel, "shadows", counted)
     one, other = made_run("map", 1), made_run("splat", 2)
     scene = GaussianComposition([PlacedRun(one), PlacedRun(other, Pose(translation=[0.6, 0.5, 0.5]))])
     scene.predict(EYE, SUN)

@@ -243,22 +243,38 @@ def test_a_glossy_surface_mirrors_most_at_grazing_angles():
     assert found == pytest.approx(0.6 * expected, rel=0.1)
 
 
-@pytest.mark.parametrize("linear", [True, False])
-def test_what_is_dimmed_is_as_if_its_whole_colour_were(linear):
-    """By the share that reaches the one that is seen (4.16), sRGB values as they stand."""
-    splats, light = shining(wall_and_receiver([0, 0, 0.3], [0, 0, -1]), 0.5)
-    light.config = replace(light.config, linear=linear)
-    up, share = np.array([0.0, 0, 1]), np.random.default_rng(0).uniform(0, 1, splats.count)
+@pytest.mark.parametrize("gloss", [False, True])
+def test_light_bounces_from_where_other_models_leave_sunlight(gloss):
+    """A receiver in their shadow is lit as before by a wall in the Sun, and by none of a wall that they shade."""
+    splats, up = wall_and_receiver([0, 0, 0.3], [0, 0, -1]), np.array([0.0, 0, 1])
+    light = model()
+    if gloss:
+        splats, light = shining(splats, 0.5)
+        light.config = replace(light.config, linear=True)
     camera = Pinhole.of(Camera(look_at([0.01, 0, -3], [0, 0, 0.3]), 8, 8, 8, 8, 4, 4))
-    whole = light.sunlight(splats, up)
-    once = whole.dimmed(upload(share), linear)
-    bright, dimmed, twice = (
-        np.array([numbers(color) for color in light.shade_picture(splats, camera, up, arriving)[0]])
-        for arriving in (whole, once, once.dimmed(upload(share), linear))
-    )
-    assert np.abs(bright[:, -1] - 0.6).max() > 0.1
-    np.testing.assert_allclose(dimmed, share * bright, atol=5e-3)
-    np.testing.assert_allclose(twice, share**2 * bright, atol=1e-2)
+
+    def lit(of_wall: float, of_receiver: float) -> tuple[np.ndarray, np.ndarray]:
+        """(what bounces onto the receiver, its colour) where so much of the Sun is left to each."""
+        share = np.full(splats.count, of_wall)
+        share[-1] = of_receiver
+        behind = light.arriving(splats, up, upload(share))
+        np.testing.assert_allclose(numbers(behind.visibility), share, atol=1e-6)
+        colors, visibility = light.shade_picture(splats, camera, up, behind)
+        assert visibility is not None
+        return np.array([numbers(row)[-1] for row in behind.bounced]), np.array([numbers(c)[-1] for c in colors])
+
+    alone = light.sunlight(splats, up)
+    whole, color = lit(1, 1)
+    np.testing.assert_allclose(whole, [numbers(row)[-1] for row in alone.bounced], rtol=1e-6)
+    np.testing.assert_allclose(color, [numbers(c)[-1] for c in light.shade_picture(splats, camera, up)[0]], rtol=1e-5)
+    assert whole[:3].min() > 0.1
+    shaded, color = lit(1, 0)
+    np.testing.assert_allclose(shaded, whole, rtol=1e-6)
+    assert color.min() > 0.02, "no sunlight, but what the wall scatters"
+    np.testing.assert_allclose(lit(0.25, 1)[0], 0.25 * whole, rtol=1e-5)
+    dark, color = lit(0, 0)
+    assert np.abs(dark).max() == np.abs(color).max() == 0
+    np.testing.assert_array_equal(numbers(light.sunlight(splats, up).bounced[0]), numbers(alone.bounced[0]))
 
 
 @pytest.mark.parametrize(
