@@ -499,9 +499,13 @@ def test_arrays_are_read_without_synchronising(monkeypatch, library):
         del ints, floats
         wide, halves = (read.wait() for read in reads)
         assert (wide.dtype, halves.dtype) == (np.uint32, np.float32)
-        np.testing.assert_array_equal(wide, np.arange(size, dtype=np.uint32) ** 2)
         np.testing.assert_array_equal(halves, np.arange(size) / 2)
-        wide[:] = 7  # memory of its own
+        ones = dr.full(ad.UInt32, 1, size)
+        dr.eval(ones)
+        dropped, last = readback.AsyncArray(ones), readback.AsyncArray(ones)
+        del dropped
+        assert last.wait().sum() == size
+        np.testing.assert_array_equal(wide, np.arange(size, dtype=np.uint32) ** 2, "memory of its own")
 
 
 @pytest.mark.gpu

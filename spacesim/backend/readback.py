@@ -18,10 +18,12 @@ import numpy as np
 from spacesim.backend.arrays import Float, UInt32, UInt64
 from spacesim.backend.selection import load_drjit, select
 
-MAX_BYTES = 2**26  #: of an array that is copied on its own: such memory of the host's is kept
+MAX_BYTES = 2**26  #: of an array that is copied on its own: such memory of the host's is scarce
+_KEPT = 8  # bytes of the host's for a number
 _LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
 _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
+    "free": ("_Z8jit_freePv", None, (c_void_p,)),
     "copy": ("_Z16jit_memcpy_async10JitBackendPvPKvm", None, (c_uint32, c_void_p, c_void_p, c_size_t)),
     "address": ("_Z12jit_var_datajPPv", c_uint32, (c_uint32, c_void_p)),
     "release": ("_Z20jit_var_dec_ref_implj", None, (c_uint32,)),
@@ -73,23 +75,39 @@ class _Copy:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
         dr = load_drjit()
         backend, size = dr.backend_v(array).value, dr.itemsize_v(array)
-        self._type, self._count = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), count
-        free = _local.free.setdefault(size * count, [])
-        self._slot = free.pop() if free else _HostSlot(functions["allocate"](backend, size * count, _SHARED))
+        self._type, self._bytes = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), size * count
+        self._free = functions["free"] if self._bytes > _KEPT else None
+        if self._free is None and _local.free:
+            self._slot = _local.free.pop()
+        else:
+            self._slot = _HostSlot(functions["allocate"](backend, max(self._bytes, _KEPT), _SHARED))
+        self._is_pending = True
         start = c_void_p()
         variable = functions["address"](array.index, ctypes.byref(start))
-        functions["copy"](backend, self._slot.address, (start.value or 0) + size * first, size * count)
+        functions["copy"](backend, self._slot.address, (start.value or 0) + size * first, self._bytes)
         functions["release"](variable)
         self._slot.record(functions)
 
     def wait(self) -> np.ndarray:
         """[count], once."""
         self._slot.event.wait()
-        size = self._type.itemsize * self._count
-        memory: Any = (ctypes.c_char * size).from_address(self._slot.address)
+        memory: Any = (ctypes.c_char * self._bytes).from_address(self._slot.address)
         entries: np.ndarray = np.frombuffer(memory, self._type).copy()
-        _local.free[size].append(self._slot)
+        self._give_back()
         return entries
+
+    def _give_back(self) -> None:
+        """The memory, once the device has written into it."""
+        self._is_pending = False
+        if self._free is None:
+            _local.free.append(self._slot)
+        else:
+            self._free(self._slot.address)
+
+    def __del__(self) -> None:
+        if getattr(self, "_is_pending", False):
+            self._slot.event.wait()
+            self._give_back()
 
 
 def can_read_async() -> bool:
@@ -98,7 +116,7 @@ def can_read_async() -> bool:
 
 
 class _HostSlot:
-    """Memory of the host's, and an event. Never given back: slots are few, and used again."""
+    """Memory of the host's, and an event. Those for a number are never given back: they are few, and used again."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -118,10 +136,10 @@ class _HostSlot:
 
 
 class _FreeSlots(threading.local):
-    """Of a thread, whose stream the events belong to, by bytes."""
+    """For numbers, of a thread, whose stream the events belong to."""
 
     def __init__(self) -> None:
-        self.free: dict[int, list[_HostSlot]] = {}
+        self.free: list[_HostSlot] = []
 
 
 _local = _FreeSlots()

@@ -4,10 +4,10 @@ All surface points that face the Sun are asked for a few directions to its disc.
 on the pixels next to these, many directions are; as long as that finds more of a penumbra, next to it too.
 """
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -23,6 +23,7 @@ from spacesim.data.store import SHADOW_ATTACHED, SHADOW_LIT, SHADOW_NONE, SHADOW
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, record_on_cuda
 from spacesim.scenes.lights.emitters import Limb, kernel_input
 from spacesim.scenes.scene import MitsubaScene, Scene
+from spacesim.scenes.steps import Steps
 from spacesim.scenes.visibility import Disc, SolarDirections
 
 OFFSET = 2e-6 * RADIUS
@@ -30,11 +31,6 @@ OFFSET = 2e-6 * RADIUS
 
 MAX_RAYS = 1 << 24
 """Most shadow rays at once."""
-
-
-T = TypeVar("T")
-Steps = Generator[None, None, T]
-"""Work that stops where it waits for the device, with that at work, and gives a T in the end."""
 
 
 class Labeller:

@@ -23,9 +23,10 @@ from spacesim.backend.readback import AsyncArray
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
-from spacesim.scenes.labels import OFFSET, Labeller, Steps, T
+from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene, load
+from spacesim.scenes.steps import Steps, completed
 
 MAX_WAVEFRONT = 1 << 24
 """Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
@@ -47,16 +48,6 @@ def _check_memory(camera: Camera, spp: int) -> None:
     pixels = camera.width * camera.height
     needed = A_PIXEL * pixels + A_SAMPLE * min(spp * pixels, MAX_WAVEFRONT)
     backend.check_free_memory(needed, f"path tracing {camera.width} x {camera.height} pixels")
-
-
-def completed(steps: Steps[T]) -> T:
-    """What they give in the end."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
 
 
 class Renderer:

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from posed import seen_from
-from splats import random_splats
+from splats import random_splats, take_cudas
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
@@ -73,8 +73,11 @@ def drawn(edges: np.ndarray, density: np.ndarray, own: np.ndarray, count: int = 
     return made, {**arrays, "visible": np.array(footprints.visible)}, features
 
 
-def test_walk_matches_the_twin():
+@pytest.mark.parametrize("way", ["the backend's", "CUDA's"])
+def test_walk_matches_the_twin(monkeypatch, way):
     """Segments before, among and behind the Gaussians, some empty, some without length."""
+    if way == "CUDA's":
+        take_cudas(monkeypatch)
     rng, rays, segments = np.random.default_rng(4), CAMERA.width * CAMERA.height, 9
     distance = float(np.linalg.norm(CAMERA.position))
     edges = np.sort(rng.uniform(distance - 2, distance + 2, (rays, segments + 1)), axis=1)

@@ -24,15 +24,16 @@ from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
 from spacesim.scenes.generation.moves import as_moved
-from spacesim.scenes.labels import Steps
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
+from spacesim.scenes.steps import Steps
 from spacesim.version import __version__
 
 AT_ONCE = {"cuda": 4, "llvm": 1}
-"""Frames under way beside the newest: the device traces paths of one while the host reads others. On a CPU the host
-has no time of its own."""
+"""Frames under way beside the newest, at most: the device traces paths of one while the host reads others."""
+UNDER_WAY = 1 << 21
+"""Pixels of these: each holds about 100 bytes of the device's."""
 MAX_THREADS = 16
 IN_FLIGHT = 1 << 30
 """Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
@@ -157,6 +158,7 @@ class FrameMaker:
             self._background = Background(job.background, job.scene, job.camera.distortion, job.seed)
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
+        self._at_once = min(AT_ONCE[select()], UNDER_WAY // pixels)
 
     def make(self, specs: Sequence[FrameSpec]) -> Iterator[str]:
         """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.
@@ -189,7 +191,7 @@ class FrameMaker:
                 frame.advance()
             if any(frame.error for frame in under_way):
                 break
-            while under_way and (len(under_way) > AT_ONCE[select()] or under_way[0].is_done):
+            while under_way and (len(under_way) > self._at_once or under_way[0].is_done):
                 yield under_way.popleft().finish()
         for frame in under_way:
             yield frame.finish()

@@ -100,19 +100,18 @@ class EnsembleLight:
         member, pose = self.ensemble.members[k], self.poses[k]
         near, towards = pose.camera_in_model(camera), None if self.sun is None else pose.direction_in_model(self.sun)
         direction = b"" if towards is None else towards.tobytes()
-        arrives = direction, None if share is None else self._key_between
-        sunlight = self.cache.get(("sunlight", k), arrives, lambda: self._arriving(k, towards, direction, share))
         earth = pose.earth_in_model(self.earth) if member.run.light else None
+        # where sunlight bounces, or the Earth shines, too, colours are no multiple of the share
+        inner = share if earth is not None or member.bounces else None
+        arrives = direction, None if inner is None else self._key_between
+        sunlight = self.cache.get(("sunlight", k), arrives, lambda: self._arriving(k, towards, direction, inner))
         key = near.world_from_camera.tobytes(), arrives, earth
-        colors, visibility = self.cache.get(
-            ("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight, earth)
-        )
-        if sunlight is None and share is not None:
-            colors = [color * share for color in colors]  # 4.16
+        part = self.cache.get(("light", k), key, lambda: member.shade(Pinhole.of(near), towards, sunlight, earth))
+        colors, visibility = _dim(part, share) if inner is None else part
         return colors, visibility if member.run.has_shadows else self._past_earth(share, member.count)
 
     def _arriving(self, k: int, towards: Array | None, direction: bytes, share: Float | None) -> Sunlight | None:
-        """At member k, as `_lit` takes the share."""
+        """At member k, of a share as `_lit` takes it. towards, direction: the Sun's, in the model's frame"""
         member = self.ensemble.members[k]
         if share is None:
             return member.sunlight(towards)
@@ -163,3 +162,11 @@ class EnsembleLight:
             result.append(own if share is None else own * share)
         dr.eval(result)
         return result
+
+
+def _dim(part: Light, share: Float | None) -> Light:
+    """Colours and visibility in the shadows of others (4.16, 4.17). share: v_inter, or None where there are none"""
+    colors, visibility = part
+    if share is None:
+        return part
+    return [color * share for color in colors], share if visibility is None else visibility * share

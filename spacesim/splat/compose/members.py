@@ -84,18 +84,23 @@ class Member:
         """Of its linear colours, see `LightConfig.curve`; None where colours are sRGB values."""
         return self.run.light.config.curve if self.run.light else None
 
+    @property
+    def bounces(self) -> bool:
+        """Whether light bounces within it."""
+        return self.run.light is not None and self.run.light.config.bounce > 0
+
     def visibility(self, sun: Array | None) -> Float | None:
-        """In its own shadows, [N]; None for a run without any. sun: [3] in the model's frame"""
+        """Of the Sun in its own shadows, [N]; None for a run without any. sun: [3] in the model's frame"""
         light = self.run.light
         return None if light is None else light.visibility(self.run.gaussians, sun)
 
     def sunlight(self, sun: Array | None) -> Sunlight | None:
-        """Of that visibility; None for a run without light."""
+        """In its own shadows; None for a run without light. sun: [3] in the model's frame"""
         light = self.run.light
         return None if light is None else light.sunlight(self.run.gaussians, sun)
 
     def arriving(self, sun: Array | None, visibility: Float) -> Sunlight | None:
-        """Of another visibility, [N]; None for a run without light."""
+        """Of which so much arrives, [N]; None for a run without light. sun: [3] in the model's frame"""
         light = self.run.light
         return None if light is None else light.arriving(self.run.gaussians, sun, visibility)
 
@@ -103,7 +108,7 @@ class Member:
         self, camera: Pinhole, sun: Array | None, sunlight: Sunlight | None, earth: Earth | None = None
     ) -> tuple[list[Float], Float | None]:
         """(colours, three Floats [N], visibility of the Sun [N] or None) as the run alone has them. camera, sun, earth:
-        in the model's frame, the latter two unused by a run that knows one light;  sunlight: `sunlight` of this Sun"""
+        in the model's frame, the latter two unused by a run that knows one light;  sunlight: of this Sun"""
         run = self.run
         if run.light is None:
             return list(_harmonic_colors(run.gaussians.rows(), camera)), None

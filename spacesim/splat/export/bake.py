@@ -44,9 +44,10 @@ def bake(
     directions = fibonacci_sphere(VIEWS)
     colors = np.empty((VIEWS, 3, gaussians.count), np.float32)
     weights = np.empty((VIEWS, gaussians.count), np.float32)
-    sunlight = light.sunlight(gaussians, sun)  # from all around the same
-    if others is not None:
-        own = sunlight.visibility
+    if others is None:
+        sunlight = light.sunlight(gaussians, sun)  # from all around the same
+    else:
+        own = light.visibility(gaussians, sun)
         sunlight = light.arriving(gaussians, sun, others if own is None else own * others)
     arrays = gaussians.to_numpy()
     centre = np.median(arrays["means"].astype(np.float64), axis=0)

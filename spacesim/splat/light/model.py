@@ -299,8 +299,8 @@ class LightModel:
         embedding: np.ndarray | None = None,
         earth: Earth | None = None,
     ) -> tuple[list[Float], Float | None]:
-        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: `sunlight` of this
-        Sun, of an earlier picture;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
+        """(colours, visibility) of `shade`, for a picture: nothing is left for an adjoint. sunlight: of this Sun, of
+        `sunlight` or `arriving`;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
         the field's first layer makes of the features does not change with Sun or camera and stays for the next
         picture: as many numbers for each Gaussian as the layer has units."""
         light = self.sunlight(gaussians, sun, embedding) if sunlight is None else sunlight

@@ -209,6 +209,7 @@ def by_buckets(
     """See `blend.backward`. A thread for a bucket: what lies behind a pair is all that the pixel shows, less what
     has been blended up to the pair."""
     channels, shape = len(grad_planes.features), lists.shape
+    assert lists.tile is not None, "slots of pairs in no list are not written"
     pixels, bucket = shape.width * shape.height, state.bucket
     looks = _pixel_packets(features, state.transmittance, lists, grad_planes)
     tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)

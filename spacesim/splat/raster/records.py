@@ -1,4 +1,4 @@
-"""What blending and its adjoints read: splats as records in list order, and their alphas at a thread's pixels."""
+"""What blending and its adjoints read: splats as records, and their alphas at a thread's pixels."""
 
 import math
 from dataclasses import dataclass
@@ -63,15 +63,14 @@ def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[F
     numbers = [splats.x, splats.y, -0.5 * LOG2_E * splats.a, -LOG2_E * splats.b, -0.5 * LOG2_E * splats.c]
     numbers += [dr.log2(dr.maximum(splats.opacity, 1e-30)), *features]
     index = dr.arange(ad.UInt32, dr.width(splats.x))
-    records = [store(values, index, capacity) for values in packets(numbers)]
-    dr.eval(records)
-    return records
+    return [store(values, index, capacity) for values in packets(numbers)]
 
 
 def list_records(records: list[Float], capacity: int, lists: TileLists) -> list[Float]:
     """`pack_records` of that capacity as `load_listed` reads them."""
     if lists.capacity == 0:
         return []
+    dr.eval(records)
     if select() not in IN_ORDER:
         return records
     position = dr.arange(ad.UInt32, lists.capacity)

@@ -151,7 +151,7 @@ def _prepare_boxes(inputs: Inputs, more: Planes, count: UInt32, capacity: int, g
     """Of `count` splats [capacity]. more: blended beside the outputs"""
     splats, footprints, groups = _prepare_all(inputs, more)
     records = pack_records(splats, _features(groups), capacity)
-    dr.eval(splats, footprints, groups)
+    dr.eval(splats, footprints, groups, records)
     return _Prepared(splats, footprints, groups, records, make_boxes(splats, footprints, count, capacity, grid))
 
 

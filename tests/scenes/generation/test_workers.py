@@ -14,6 +14,7 @@ from forks import Forked
 from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.records import Sun
 from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation import frames, workers
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writing_threads
@@ -130,8 +131,9 @@ def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
 
 @pytest.mark.parametrize("at_once", [0, 1, 3])
 def test_frames_are_the_same_however_many_are_under_way(job, tmp_path, monkeypatch, at_once):
-    """Some of them whole already."""
+    """Some of them whole already; under another Sun each."""
     work, specs = job
+    specs = [replace(spec, sun=Sun.from_angles(70 * spec.index, 20)) for spec in specs]
     one = replace(work, root=tmp_path / "one")
     assert list(FrameMaker(one).make(specs)) == [spec.name for spec in specs]
     monkeypatch.setattr(frames, "AT_ONCE", dict.fromkeys(frames.AT_ONCE, at_once))

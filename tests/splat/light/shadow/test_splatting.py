@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from splats import random_splats
+from splats import random_splats, take_cudas
 from walls import acne, screen_shadow, way
 
 from spacesim.backend import ad, recorded
@@ -72,6 +72,7 @@ def sheet(height: float, low: float, high: float, spacing: float = 0.05, opacity
 def _ways(request, monkeypatch) -> None:
     """That of CUDA gives the same on a CPU, where it is slower."""
     if request.param == "CUDA's way":
+        take_cudas(monkeypatch)
         monkeypatch.setattr(splatting, "select", lambda: "cuda")
         monkeypatch.setattr(splatting, "_walk", recorded(splatting._walk.traced))
 

@@ -8,6 +8,7 @@ from skimage.metrics import structural_similarity
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
+from spacesim.splat.train.loss import photometric
 from spacesim.splat.train.loss.photometric import photometric_loss
 
 WIDTH, HEIGHT = 31, 23
@@ -95,10 +96,13 @@ def test_gradient_of_ssim_matches_central_differences():
         assert gradient[index] == pytest.approx(slope, rel=5e-3, abs=1e-3 * float(np.abs(gradient).max()))
 
 
+@pytest.mark.parametrize("way", ["the backend's", "CUDA's"])
 @pytest.mark.parametrize("weight", [0.2, 1.0])
 @pytest.mark.parametrize("size", [(1, 1), (3, 40), (33, 8), (50, 27)])
-def test_loss_and_gradient_equal_their_twin(size, weight):
+def test_loss_and_gradient_equal_their_twin(monkeypatch, size, weight, way):
     """Of pictures smaller than the window, and of those that end within a thread's pixels."""
+    if way == "CUDA's":
+        monkeypatch.setattr(photometric, "select", lambda: "cuda")
     rng = np.random.default_rng(5)
     x, y = rng.uniform(size=(2, 3, *size)).astype(np.float32)
     y[:, size[0] // 2 + 1 :] = x[:, size[0] // 2 + 1 :]
