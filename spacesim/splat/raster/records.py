@@ -14,9 +14,9 @@ from spacesim.splat.raster.project import ALPHA_MIN, Splats
 ALPHA_MAX = 0.999  #: a splat never hides everything behind it
 POWER_MIN = math.log2(ALPHA_MIN)  #: of what is blended
 TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished before the first splat behind which no more than this would pass
-#: backends on which threads read records in the lists' order, elsewhere by the splats' numbers: two cores take 4 % less
-#: for a frame, an H100 takes 9 % more
-IN_ORDER = ("llvm",)
+#: splats from which on records are copied in the lists' order first; of fewer threads read them by the splats' numbers:
+#: 9 % less of a frame on an H100, 4 % more on two cores; a million are more than the device's cache holds
+IN_ORDER = {"cuda": 2**19, "llvm": 0}
 PACKETS = {"cuda": (1, 2, 4), "llvm": (2, 4, 8)}  #: numbers that a thread reads or adds at once
 LOG2_E = 1.4426950408889634
 
@@ -71,7 +71,7 @@ def list_records(records: list[Float], capacity: int, lists: TileLists) -> list[
     if lists.capacity == 0:
         return []
     dr.eval(records)
-    if select() not in IN_ORDER:
+    if capacity < IN_ORDER[select()]:
         return records
     position = dr.arange(ad.UInt32, lists.capacity)
     records = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in records]
@@ -83,9 +83,9 @@ def load_listed(
     records: list[Float], capacity: int, lists: TileLists, k: UInt32, active: Bool | bool = True
 ) -> list[Float]:
     """The record of the splat in place k of the lists; 0 where not `active`. capacity: as in `list_records`"""
-    if select() in IN_ORDER:
-        return load(records, k, lists.capacity, active)
-    return load(records, dr.gather(ad.UInt32, lists.splat, k, active), capacity, active)
+    if capacity < IN_ORDER[select()]:
+        return load(records, dr.gather(ad.UInt32, lists.splat, k, active), capacity, active)
+    return load(records, k, lists.capacity, active)
 
 
 def packet_sizes(numbers: int) -> list[int]:
