@@ -16,7 +16,8 @@ TOP = ("cli", "demo", "doctor", "api", "methods", "reproduce")  #: over all fold
 ABOVE = ("data", "learning", "scenes", "splat", "nerf", "mixed", "eval", "viewer", "serve", *TOP)  #: over `backend`
 FORBIDDEN = {
     "backend": (*(f"spacesim.{top}" for top in ABOVE), "numpy"),
-    "backend.upload": tuple(f"spacesim.{top}" for top in ABOVE),  # what else the package does goes without numpy
+    # arrays of numpy's to the device and back; what else the package does goes without numpy
+    **dict.fromkeys(("backend.upload", "backend.readback"), tuple(f"spacesim.{top}" for top in ABOVE)),
     "doctor": ("spacesim.scenes", "spacesim.splat", "spacesim.viewer", "spacesim.serve", "spacesim.cli"),
     "data": (
         "mitsuba",
