@@ -50,10 +50,11 @@ class AsyncNumber:
 
 
 class AsyncArray:
-    """An evaluated array Float or UInt32 [N], read once with `wait`, by the thread that made it. Where `can_read_async`
-    is false, or the array takes more than `MAX_BYTES`, that waits for all that the device was asked for."""
+    """An array Float or UInt32 [N], read once with `wait`, by the thread that made it. Where `can_read_async` is false,
+    or the array takes more than `MAX_BYTES`, that waits for all that the device was asked for."""
 
     def __init__(self, array: Float | UInt32) -> None:
+        load_drjit().eval(array)
         count = load_drjit().width(array)
         copies = can_read_async() and 0 < 4 * count <= MAX_BYTES
         self._array, self._copy = None if copies else array, _Copy(array, 0, count) if copies else None

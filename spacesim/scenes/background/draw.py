@@ -13,6 +13,7 @@ from spacesim.scenes.background.stars import Stars
 from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene
+from spacesim.scenes.steps import Steps, completed
 
 TRIES = 64  #: to have sunlit ground behind the objects
 SUN_UP = 0.2  #: sine of the Sun's elevation there, at least: lower, the ground is dim beside the objects
@@ -71,15 +72,25 @@ class Background:
 
         earth: where the Earth is, None: as the scene says; sky: [3, 3] from the world's axes to those in which stars
         and a fixed Earth's ground stand still, None: the world's."""
+        return completed(self.drawing(camera, sun, index, earth, sky))
+
+    def drawing(
+        self, camera: Camera, sun: Sun, index: int, earth: EarthConfig | None = None, sky: Array | None = None
+    ) -> Steps[np.ndarray]:
+        """`radiance` in steps; in the first the device is asked for the Earth."""
+        place = self.placement(camera, sun, index, earth, sky)
+        globe = None if place is None or self._globe is None else self._globe.drawing(camera, sun, place)
+        if globe is not None:
+            next(globe)
+        yield
         result = np.zeros((camera.height, camera.width, 3), np.float32)
         if self._stars is not None:
             pose = camera.world_from_camera.copy()
             pose[:3, :3] = pose[:3, :3] if sky is None else sky @ pose[:3, :3]
             stars = self._stars.draw(replace(camera, world_from_camera=pose), self._distortion)
             result += np.float32(self._config.star_gain) * stars[..., None]
-        place = self.placement(camera, sun, index, earth, sky)
-        if place is not None and self._globe is not None:
-            light, cover = self._globe.draw(camera, sun, place)
+        if globe is not None:
+            light, cover = yield from globe
             result = result * (1 - cover[..., None]) + light
         return result
 

@@ -24,12 +24,14 @@ import numpy as np
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.readback import AsyncArray
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.background.noise import octaves
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, Units, record_on_cuda
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
 from spacesim.scenes.lights.emitters import kernel_input
+from spacesim.scenes.steps import Steps, completed
 
 OCEAN, FOREST, STEPPE, DESERT = (0.022, 0.038, 0.062), (0.055, 0.085, 0.040), (0.16, 0.15, 0.085), (0.38, 0.30, 0.20)
 ICE, CLOUD = (0.74, 0.77, 0.80), (0.74, 0.74, 0.74)
@@ -84,11 +86,16 @@ class Globe:
     def draw(self, camera: Camera, sun: Sun, place: Placement) -> tuple[np.ndarray, np.ndarray]:
         """(radiance [H, W, 3], W m^-2 sr^-1, of ground, clouds and air; cover [H, W], the share of each pixel that the
         ground fills)."""
+        return completed(self.drawing(camera, sun, place))
+
+    def drawing(self, camera: Camera, sun: Sun, place: Placement) -> Steps[tuple[np.ndarray, np.ndarray]]:
+        """`draw` in two steps."""
         view = KernelCamera.of(camera, self._units)
         axes = [kernel_input(axis) for axis in place.globe_from_world]
         inputs = kernel_input(place.direction), kernel_input(place.distance), *axes, kernel_input(sun.direction)
-        values = self._trace(view, inputs, self._irradiance, self._seed).numpy()
-        shape = camera.height, camera.width
+        read = AsyncArray(self._trace(view, inputs, self._irradiance, self._seed))
+        yield
+        values, shape = read.wait(), (camera.height, camera.width)
         count = math.prod(shape)
         return values[: 3 * count].reshape(*shape, 3), values[3 * count :].reshape(shape)
 

@@ -200,14 +200,16 @@ class FrameMaker:
         """Of a frame's truth."""
         if self._writer.has_frame(spec.name):
             return None
-        seed = (self._job.seed, spec.index)
+        seed, background = (self._job.seed, spec.index), None
+        if self._background is not None:
+            background = self._background.drawing(spec.camera, spec.sun, spec.index, spec.earth, spec.sky_from_world)
+            next(background)
         renderer = as_moved(self._renderer, spec.objects)
         truth = yield from renderer.rendering(spec.camera, spec.sun, seed, spec.spp, spec.earth)
         truth = dim(truth, spec.sunlight)
-        if self._background is None:
+        if background is None:
             return truth
-        behind = self._background.radiance(spec.camera, spec.sun, spec.index, spec.earth, spec.sky_from_world)
-        return replace(truth, radiance_background=behind)
+        return replace(truth, radiance_background=(yield from background))
 
     def _write(self, spec: FrameSpec, truth: Truth) -> str:
         seed, behind = (self._job.seed, spec.index), truth.radiance_background
