@@ -35,6 +35,7 @@ from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.output import RenderOutput, over_alpha
 from spacesim.splat.raster.project import Footprints
 from spacesim.splat.raster.project import Splats as Projected
+from spacesim.splat.raster.records import ListedRecords
 from spacesim.splat.raster.render import blend, median_depth, prepare
 from spacesim.splat.raster.supersample import render_supersampled, upsampled_camera
 
@@ -216,7 +217,7 @@ def _blend_splats(
         lists = bin_splats(empty, nowhere, camera.width, camera.height)
         planes = np.zeros((3 + COMMON + 3 * normals + len(lit.shares), size), np.float32)
         planes[0] = 1
-        return ListedSplats([], 0, lists, COMMON + 3 * normals + len(lit.shares)), planes
+        return ListedSplats(ListedRecords([], 0), lists, COMMON + 3 * normals + len(lit.shares)), planes
     outputs = ("depth", "normal") if normals else ("depth",)
     splats, footprints, groups = prepare(gaussians.rows(), camera, None, outputs, antialiased)
     seen = dr.full(ad.Float, 1, gaussians.count) if lit.visibility is None else lit.visibility

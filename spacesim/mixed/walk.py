@@ -18,11 +18,10 @@ from spacesim.splat.raster.records import (
     ALPHA_MAX,
     POWER_MIN,
     TRANSMITTANCE_MIN,
+    ListedRecords,
     exp2,
     list_records,
     load,
-    load_listed,
-    pack_records,
     packets,
     store,
 )
@@ -44,22 +43,20 @@ class Segments:
 class ListedSplats:
     """The splats of a picture's tiles, nearest first, with their features."""
 
-    records: list[Float]  #: of `list_records`; the first feature is the depth
-    capacity: int  #: of `pack_records`
+    records: ListedRecords  #: the first feature is the depth
     lists: TileLists  #: which splats each tile has
     features: int  #: without the depth
 
 
 def listed(splats: Splats, features: list[Float], lists: TileLists) -> ListedSplats:
     """For `blend_segments`. features: [N] each"""
-    capacity = round_capacity(dr.width(splats.x))
-    records = _records(splats, [splats.depth, *features], lists, capacity)
-    return ListedSplats(records, capacity, lists, len(features))
+    records = _records(splats, [splats.depth, *features], lists, round_capacity(dr.width(splats.x)))
+    return ListedSplats(records, lists, len(features))
 
 
 @recorded
-def _records(splats: Splats, features: list[Float], lists: TileLists, capacity: int) -> list[Float]:
-    return list_records(pack_records(splats, features, capacity), capacity, lists)
+def _records(splats: Splats, features: list[Float], lists: TileLists, capacity: int) -> ListedRecords:
+    return list_records(splats, features, lists, capacity)
 
 
 @dataclass
@@ -162,4 +159,4 @@ def blend_segments(
 def _splat(splats: ListedSplats, k: UInt32, active: Bool) -> list[Float]:
     if splats.lists.capacity == 0:  # there is none
         return [ad.Float(0)] * (OF_SPLAT + 1 + splats.features)
-    return load_listed(splats.records, splats.capacity, splats.lists, k, active)
+    return splats.records.load(splats.lists, k, active)

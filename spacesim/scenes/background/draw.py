@@ -79,7 +79,7 @@ class Background:
     ) -> Steps[np.ndarray]:
         """`radiance` in steps; in the first the device is asked for the Earth."""
         place = self.placement(camera, sun, index, earth, sky)
-        globe = None if place is None or self._globe is None else self._globe.drawing(camera, sun, place)
+        globe = None if place is None or self._globe is None else self._globe.draw(camera, sun, place)
         if globe is not None:
             next(globe)
         yield

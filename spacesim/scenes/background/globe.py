@@ -31,7 +31,7 @@ from spacesim.scenes.background.noise import octaves
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, Units, record_on_cuda
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM
 from spacesim.scenes.lights.emitters import kernel_input
-from spacesim.scenes.steps import Steps, completed
+from spacesim.scenes.steps import Steps
 
 OCEAN, FOREST, STEPPE, DESERT = (0.022, 0.038, 0.062), (0.055, 0.085, 0.040), (0.16, 0.15, 0.085), (0.38, 0.30, 0.20)
 ICE, CLOUD = (0.74, 0.77, 0.80), (0.74, 0.74, 0.74)
@@ -83,13 +83,9 @@ class Globe:
         self._seed = dr.opaque(backend.mitsuba().UInt32, seed)
         self._trace = record_on_cuda(self._shade)
 
-    def draw(self, camera: Camera, sun: Sun, place: Placement) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self, camera: Camera, sun: Sun, place: Placement) -> Steps[tuple[np.ndarray, np.ndarray]]:
         """(radiance [H, W, 3], W m^-2 sr^-1, of ground, clouds and air; cover [H, W], the share of each pixel that the
         ground fills)."""
-        return completed(self.drawing(camera, sun, place))
-
-    def drawing(self, camera: Camera, sun: Sun, place: Placement) -> Steps[tuple[np.ndarray, np.ndarray]]:
-        """`draw` in two steps."""
         view = KernelCamera.of(camera, self._units)
         axes = [kernel_input(axis) for axis in place.globe_from_world]
         inputs = kernel_input(place.direction), kernel_input(place.distance), *axes, kernel_input(sun.direction)

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -120,9 +119,19 @@ class _FrameUnderWay:
     """A frame whose first step is taken."""
 
     def __init__(self, spec: FrameSpec, steps: Steps[Truth | None]) -> None:
-        self.is_done, self.error = False, cast("Exception | None", None)
-        self._spec, self._steps, self._truth = spec, steps, cast("Truth | None", None)
+        self._spec, self._steps = spec, steps
+        self._truth: Future[Truth | None] = Future()
         self.advance()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether no step is left."""
+        return self._truth.done()
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether a step has met an error."""
+        return self.is_done and self._truth.exception() is not None
 
     def advance(self) -> None:
         """By a step, if there is one left."""
@@ -131,17 +140,15 @@ class _FrameUnderWay:
         try:
             next(self._steps)
         except StopIteration as end:
-            self.is_done, self._truth = True, end.value
+            self._truth.set_result(end.value)
         except Exception as error:
-            self.is_done, self.error = True, error
+            self._truth.set_exception(error)
 
     def finish(self) -> tuple[FrameSpec, Truth | None]:
         """The frame, with all its steps taken. Raises the error that one of them met."""
         while not self.is_done:
             self.advance()
-        if self.error is not None:
-            raise self.error
-        return self._spec, self._truth
+        return self._spec, self._truth.result()
 
 
 class FrameMaker:
@@ -171,11 +178,7 @@ class FrameMaker:
                 for spec, truth in self._rendered(specs):
                     while waiting and (waiting[0].done() or len(waiting) >= self._most):
                         yield waiting.popleft().result()
-                    if truth is None:
-                        waiting.append(Future())
-                        waiting[-1].set_result(spec.name)
-                    else:
-                        waiting.append(pool.submit(self._write, spec, truth))
+                    waiting.append(pool.submit(self._write, spec, truth))
                 while waiting:
                     yield waiting.popleft().result()
             finally:
@@ -189,7 +192,7 @@ class FrameMaker:
             under_way.append(_FrameUnderWay(spec, self._steps(spec)))
             for frame in list(under_way)[:-1]:
                 frame.advance()
-            if any(frame.error for frame in under_way):
+            if any(frame.has_failed for frame in under_way):
                 break
             while under_way and (len(under_way) > self._at_once or under_way[0].is_done):
                 yield under_way.popleft().finish()
@@ -211,7 +214,9 @@ class FrameMaker:
             return truth
         return replace(truth, radiance_background=(yield from background))
 
-    def _write(self, spec: FrameSpec, truth: Truth) -> str:
+    def _write(self, spec: FrameSpec, truth: Truth | None) -> str:
+        if truth is None:
+            return spec.name
         seed, behind = (self._job.seed, spec.index), truth.radiance_background
         camera = self._job.camera if spec.exposure is None else replace(self._job.camera, exposure=spec.exposure)
         recording = record_image(truth.radiance, truth.alpha, camera, seed, behind)

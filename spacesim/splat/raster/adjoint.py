@@ -28,7 +28,6 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     load,
-    load_listed,
     packet,
     packet_sizes,
     packets,
@@ -93,7 +92,7 @@ def by_tiles(
 
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
-        record = load_listed(state.records, state.capacity, lists, k)
+        record = state.records.load(lists, k)
         dx, dy = thread.x - record[0], thread.y - record[1]
         a, b, c = record[2], record[3], record[4]
         powers = exponents(record, thread.x, thread.y, shape)
@@ -302,7 +301,7 @@ def _buckets(state: BlendState, lists: TileLists, number: UInt32) -> _Buckets:
 def _record(state: BlendState, buckets: _Buckets, i: int, lists: TileLists) -> list[Float]:
     """Of pair i of each bucket; zeros where there is none, which no pixel has blended."""
     listed = buckets.first + i < buckets.end
-    return load_listed(state.records, state.capacity, lists, buckets.first + i, listed)
+    return state.records.load(lists, buckets.first + i, listed)
 
 
 def _pixel_packets(

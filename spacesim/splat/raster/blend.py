@@ -26,8 +26,6 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     list_records,
-    load_listed,
-    pack_records,
     store,
 )
 
@@ -63,17 +61,15 @@ def blend_lists(
     height: int,
     capacity: int,
     bucket: int | None = None,
-    records: list[Float] | None = None,
+    packed: list[Float] | None = None,
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for that by tiles, None where there is none;  records: `pack_records`, where they are there"""
+    adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
     shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
     channels, pixels = len(features), lists.shape.pixels
     turn = TURN[select()]
     assert not bucket or bucket % turn == 0, "a bucket is some turns of the loop"
-    if records is None and lists.capacity > 0:
-        records = pack_records(splats, features, capacity)
-    records = list_records(records or [], capacity, lists)
+    records = list_records(splats, features, lists, capacity, packed)
     thread = thread_pixels(lists)
     start, end = (dr.gather(ad.UInt32, bounds, thread.tile) for bounds in (lists.start, lists.end))
     snapshots = _Checkpoints(lists, bucket, channels, thread.place, start, end) if bucket else None
@@ -89,7 +85,7 @@ def blend_lists(
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
-            record = load_listed(records, capacity, lists, k + u, listed)
+            record = records.load(lists, k + u, listed)
             powers = exponents(record, thread.x, thread.y, shape)
             for p in range(pixels):
                 alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
@@ -130,7 +126,6 @@ def blend_lists(
             transmittance=store(transmittance, thread.place, threads),
             last=store(last, thread.place, threads),
             records=records,
-            capacity=capacity,
             bucket=bucket,
             checkpoints=snapshots.states if snapshots else [],
             bucket_tile=snapshots.tile if snapshots else None,

@@ -25,14 +25,27 @@ _ROUNDING = 1.5 * 2.0**23  #: added to a float below 2^22, it leaves its integer
 
 
 @dataclass
+class ListedRecords:
+    """The records of splats for walks along their tiles' lists."""
+
+    arrays: list[Float]  #: of `pack_records`; from `IN_ORDER` splats on copied in the lists' order
+    capacity: int  #: of `pack_records`
+
+    def load(self, lists: TileLists, k: UInt32, active: Bool | bool = True) -> list[Float]:
+        """The record of the splat in place k of the lists; 0 where not `active`."""
+        if self.capacity < IN_ORDER[select()]:
+            return load(self.arrays, dr.gather(ad.UInt32, lists.splat, k, active), self.capacity, active)
+        return load(self.arrays, k, lists.capacity, active)
+
+
+@dataclass
 class BlendState:
     """What blending leaves behind for its way back. What is [T * pixels of a tile] is tile-major: a tile's pixels stand
     thread by thread, a thread's as in `thread_offsets`."""
 
     transmittance: Float  #: what passes through all splats, [T * pixels of a tile]
     last: UInt32  #: one past the last pair blended of each pixel, [T * pixels of a tile]
-    records: list[Float]  #: of `list_records`
-    capacity: int  #: records
+    records: ListedRecords  #: of the splats
     bucket: int  #: pairs of a bucket of the adjoint, 0 for none
     #: transmittance and sums of each pixel of a bucket's tile before the bucket, by fours, [4 B * pixels of a tile]
     #: each, without meaning where the pixel's thread did not reach it
@@ -66,26 +79,21 @@ def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[F
     return [store(values, index, capacity) for values in packets(numbers)]
 
 
-def list_records(records: list[Float], capacity: int, lists: TileLists) -> list[Float]:
-    """`pack_records` of that capacity as `load_listed` reads them."""
+def list_records(
+    splats: Splats, features: list[Float], lists: TileLists, capacity: int, packed: list[Float] | None = None
+) -> ListedRecords:
+    """capacity: length of the splats' arrays;  packed: `pack_records`, where they are there"""
     if lists.capacity == 0:
-        return []
-    dr.eval(records)
+        return ListedRecords([], capacity)
+    if packed is None:
+        packed = pack_records(splats, features, capacity)
+    dr.eval(packed)
     if capacity < IN_ORDER[select()]:
-        return records
+        return ListedRecords(packed, capacity)
     position = dr.arange(ad.UInt32, lists.capacity)
-    records = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in records]
-    dr.eval(records)
-    return records
-
-
-def load_listed(
-    records: list[Float], capacity: int, lists: TileLists, k: UInt32, active: Bool | bool = True
-) -> list[Float]:
-    """The record of the splat in place k of the lists; 0 where not `active`. capacity: as in `list_records`"""
-    if capacity < IN_ORDER[select()]:
-        return load(records, dr.gather(ad.UInt32, lists.splat, k, active), capacity, active)
-    return load(records, k, lists.capacity, active)
+    ordered = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in packed]
+    dr.eval(ordered)
+    return ListedRecords(ordered, capacity)
 
 
 def packet_sizes(numbers: int) -> list[int]:

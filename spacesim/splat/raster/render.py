@@ -162,7 +162,7 @@ def _draw_boxes(
     """(the lists, of `capacity`, if they are wanted; planes)."""
     splats, groups = prepared.splats, prepared.groups
     lists = make_lists(splats, prepared.footprints, prepared.boxes, capacity, splat_capacity, grid)
-    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, records=prepared.records)
+    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, packed=prepared.records)
     return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, groups)
 
 

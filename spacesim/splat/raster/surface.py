@@ -12,18 +12,7 @@ from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import (
-    ALPHA_MAX,
-    POWER_MIN,
-    exp2,
-    exponents,
-    list_records,
-    load,
-    load_listed,
-    pack_records,
-    packets,
-    store,
-)
+from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, load, packets, store
 
 NONE = 2**32 - 1  #: in place of a splat's number
 THICKNESS = 0.05  #: of a disc, in its shorter standard deviation
@@ -86,8 +75,7 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> U
 @recorded(elements=lambda _, splats, lists, width, height, *_rest, **_named: width * height)
 def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> UInt32:
     """`median_splat` as a part of recordings. capacity: length of the splats' arrays"""
-    records = list_records(pack_records(splats, [], capacity), capacity, lists)
-    thread, pixels = thread_pixels(lists), lists.shape.pixels
+    records, thread, pixels = list_records(splats, [], lists, capacity), thread_pixels(lists), lists.shape.pixels
 
     def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
@@ -96,8 +84,7 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
         k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]
     ) -> tuple[UInt32, UInt32, list[Float], list[UInt32]]:
         transmittance, place = list(transmittance), list(place)
-        record = load_listed(records, capacity, lists, k)
-        powers = exponents(record, thread.x, thread.y, lists.shape)
+        powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
         for p in range(pixels):
             passing = transmittance[p] >= 0.5
             drawn = dr.minimum(exp2(powers[p]), ALPHA_MAX)

@@ -27,6 +27,7 @@ from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scenefile import scene_text
+from spacesim.scenes.steps import completed
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 20), "spp": 4, "points": 50}
 BOTH = BackgroundConfig(star_gain=1e5)
@@ -187,7 +188,7 @@ def test_the_limb_is_where_geometry_has_it(globe, altitude_km):
     limb: np.ndarray = np.array([math.cos(earth.angular_radius), 0.0, math.sin(earth.angular_radius)])
     camera = camera_towards([0.98, 0.1, 0.15] if altitude_km > 1e4 else limb)
     place = Placement(np.array([1.0, 0.0, 0.0]), earth.distance, np.eye(3))
-    _, cover = globe.draw(camera, Sun(np.array([1.0, 1.0, 1.0])), place)
+    _, cover = completed(globe.draw(camera, Sun(np.array([1.0, 1.0, 1.0])), place))
     fine = replace(camera, width=1600, height=1600, fx=8 * camera.fx, fy=8 * camera.fy, cx=800.0, cy=800.0)
     inside = np.arccos(np.clip(rays(fine)[..., 0], -1, 1)) < earth.angular_radius
     expected = inside.reshape(200, 8, 200, 8).mean(axis=(1, 3))
@@ -202,7 +203,7 @@ def test_the_terminator_is_where_the_sun_sets(globe):
     that the Sun still reaches, 3 degrees on."""
     place = Placement(np.array([1.0, 0.0, 0.0]), EarthConfig(altitude_km=20_000.0).distance, np.eye(3))
     camera, sun = camera_towards([1.0, 0.0, 0.0]), Sun(np.array([-0.3, 1.0, 0.2]))
-    light, cover = globe.draw(camera, sun, place)
+    light, cover = completed(globe.draw(camera, sun, place))
     directions = rays(camera)
     along = place.distance * directions[..., 0]
     depth = along - np.sqrt(np.maximum(along**2 - place.distance**2 + 1, 0))

@@ -26,11 +26,10 @@ from spacesim.splat.raster.records import (
     ALPHA_MAX,
     POWER_MIN,
     TRANSMITTANCE_MIN,
+    ListedRecords,
     exp2,
     exponents,
     list_records,
-    load_listed,
-    pack_records,
     packet_sizes,
     store,
 )
@@ -194,8 +193,7 @@ class _WalkTape:
 
     transmittance: Float
     last: UInt32
-    records: list[Float]  #: of `list_records`, of the events
-    capacity: int  #: Gaussians
+    records: ListedRecords  #: of the events, of whose capacity one half are receivers
 
 
 @dataclass
@@ -215,7 +213,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     """What each receiver has lost; one thread holds a block of a tile's pixels."""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
-    records = list_records(pack_records(events, [], 2 * capacity), 2 * capacity, lists)
+    records = list_records(events, [], lists, 2 * capacity)
     receivers = dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text, as in `make_events`
     threads, thread = lists.tiles_x * lists.tiles_y * shape.threads, thread_pixels(lists)
     inside = [_inside(thread, offset, image_size) for offset in thread_offsets(shape)]
@@ -251,7 +249,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
         listed = [k + u < end if u else ad.Bool(True) for u in range(turn)]
         numbers = [dr.gather(ad.UInt32, lists.splat, k + u, listed[u]) for u in range(turn)]
-        loaded = [load_listed(records, 2 * capacity, lists, k + u, listed[u]) for u in range(turn)]
+        loaded = [records.load(lists, k + u, listed[u]) for u in range(turn)]
         for u, record in enumerate(loaded):
             powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < receivers
             if branches:
@@ -270,8 +268,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
     tape = None
     if adjoint:
-        left, past = (store(of_pixels, thread.place, threads) for of_pixels in (transmittance, last))
-        tape = _WalkTape(left, past, records, capacity)
+        tape = _WalkTape(store(transmittance, thread.place, threads), store(last, thread.place, threads), records)
     dr.eval(slots, tape)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
@@ -320,7 +317,8 @@ def _replay(
     dr.eval(shares)
     slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
     mode = reduce_mode(32 * lists.capacity, shape)
-    start, receivers = dr.gather(ad.UInt32, lists.start, thread.tile), dr.opaque(ad.UInt32, tape.capacity)
+    start = dr.gather(ad.UInt32, lists.start, thread.tile)
+    receivers = dr.opaque(ad.UInt32, tape.records.capacity // 2)
 
     def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
         return k > start
@@ -328,7 +326,7 @@ def _replay(
     def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
         k = k - 1
         event = dr.gather(ad.UInt32, lists.splat, k)
-        record, receiver = load_listed(tape.records, 2 * tape.capacity, lists, k), event < receivers
+        record, receiver = tape.records.load(lists, k), event < receivers
         powers = exponents(record, thread.x, thread.y, shape)
         share = dr.gather(ad.Float, shares, event, receiver)
         occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
