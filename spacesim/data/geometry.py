@@ -1,4 +1,4 @@
-"""Rotations, camera axes and directions, in float64 numpy.
+"""Rotations, camera axes, directions and the extent of points, in float64 numpy.
 
 World axes are right-handed with z up. Camera axes, when nothing else is said, are OpenCV's: x right, y down,
 z forward along the optical axis. Quaternions are (w, x, y, z). See docs/explanation/conventions.md.
@@ -147,3 +147,24 @@ def fibonacci_sphere(count: int, seed: int | None = None) -> Array:
         return points
     rotation = rotation_from_quaternion(np.random.default_rng(seed).normal(size=4))
     return points @ rotation.T
+
+
+def robust_radius(means: Array) -> float:
+    """Metres, above 0: 99 % of the points [N, 3] lie within it of their median. Of a point cloud that has outliers, as
+    any from structure from motion has, neither the farthest point nor the mean says how large the object is."""
+    return _radius_within(_from_median(means))
+
+
+def is_near(means: Array) -> NDArray[np.bool_]:
+    """[N] bool: which of the points [N, 3] are within ten times `robust_radius` of their median, and no outliers."""
+    away = _from_median(means)
+    return away <= 10 * _radius_within(away)
+
+
+def _from_median(means: Array) -> Array:
+    """[N] metres."""
+    return np.linalg.norm(means - np.median(means, axis=0), axis=1)
+
+
+def _radius_within(away: Array) -> float:
+    return max(float(np.quantile(away, 0.99)), 1e-9)

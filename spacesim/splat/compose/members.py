@@ -16,10 +16,9 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, robust_radius
 from spacesim.data.images.tone import Curve
 from spacesim.splat.compose.pose import Pose
-from spacesim.splat.light.model import robust_radius
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.light.sunlight import Sunlight

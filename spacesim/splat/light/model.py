@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
@@ -51,27 +50,6 @@ class TrainingFrame:
     scale: float  #: the unit of length of its networks
     distance: float  #: of the farthest training camera from the centre, dist_max of 4.5
     radius: float  #: `robust_radius` of the Gaussians that training started from
-
-
-def robust_radius(means: Array) -> float:
-    """Metres, above 0: 99 % of the points [N, 3] lie within it of their median. Of a point cloud that has outliers, as
-    any from structure from motion has, neither the farthest point nor the mean says how large the object is."""
-    return _radius_within(_from_median(means))
-
-
-def is_near(means: Array) -> NDArray[np.bool_]:
-    """[N] bool: which of the points [N, 3] are within ten times `robust_radius` of their median, and no outliers."""
-    away = _from_median(means)
-    return away <= 10 * _radius_within(away)
-
-
-def _from_median(means: Array) -> Array:
-    """[N] metres."""
-    return np.linalg.norm(means - np.median(means, axis=0), axis=1)
-
-
-def _radius_within(away: Array) -> float:
-    return max(float(np.quantile(away, 0.99)), 1e-9)
 
 
 @dataclass

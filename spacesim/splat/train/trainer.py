@@ -18,7 +18,7 @@ from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, is_near, robust_radius
 from spacesim.data.records import Dataset
 from spacesim.learning.adam import NetworkAdam
 from spacesim.learning.cameras import farthest_camera, focus_point, nearest_camera
@@ -26,7 +26,7 @@ from spacesim.learning.folder import TrainingProgress
 from spacesim.learning.forecast import Growth, TimeLeft
 from spacesim.learning.loop import TrainingLoop
 from spacesim.splat.light.bounce import ALBEDO, SPECULAR
-from spacesim.splat.light.model import LightModel, TrainingFrame, is_near, robust_radius
+from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.surroundings import RECOVERY, HeldSurroundings, are_due
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.gaussians import Gaussians

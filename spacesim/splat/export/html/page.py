@@ -14,12 +14,12 @@ import numpy as np
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
+from spacesim.data.geometry import robust_radius
 from spacesim.learning.folder import run_name
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
 from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
 from spacesim.splat.export.html.seen import tabulate_seen
 from spacesim.splat.export.html.sunlight import BOUNCE_SIDE, SunlightTables, sunlight_steps, tabulate_sunlight
-from spacesim.splat.light.model import robust_radius
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run
 
