@@ -1,10 +1,11 @@
-"""Frames from the path tracer to the disk: rendering goes on while threads encode and write."""
+"""Frames from the path tracer to the disk: rendering goes on while others encode and write."""
 
 import math
 import os
 import platform
+import weakref
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -20,8 +21,8 @@ from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.cameras.camera import CameraConfig
-from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.config import QualityConfig
+from spacesim.scenes.generation.encoders import EncoderProcesses, FrameEncoder, TracedFrame
 from spacesim.scenes.generation.moves import as_moved
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.render import Renderer
@@ -34,6 +35,8 @@ AT_ONCE = {"cuda": 4, "llvm": 1}
 UNDER_WAY = 1 << 21
 """Pixels of these: each holds about 100 bytes of the device's."""
 MAX_THREADS = 16
+PROCESSES_FROM = {"cuda": 1 << 16, "llvm": math.inf}
+"""Pixels of frames from which processes encode, if there may be several: on a CPU rendering leaves them no core."""
 IN_FLIGHT = 1 << 30
 """Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
 BYTES_A_PIXEL = 84
@@ -65,7 +68,7 @@ class Job:
     quality: QualityConfig  #: samples and lengths of light paths
     seed: int  #: of the noise and of what is drawn behind
     root: Path  #: the dataset's folder
-    threads: int  #: that encode, a process
+    threads: int  #: that encode, a process that renders
     background: BackgroundConfig | None = None  #: behind the objects, None: nothing
     shared: bool = False  #: other jobs make frames in the same folder now
     depth_unit: float = MILLIMETRE  #: metres a step of the pictures of depth
@@ -158,7 +161,7 @@ class FrameMaker:
         quality = job.quality
         self.root = job.root
         self._job = job
-        self._writer = job.writer
+        self._has_frame = job.writer.has_frame
         self._renderer = renderer or Renderer(job.scene, quality.spp, quality.max_depth, job.camera.distortion)
         self._background = None
         if job.background is not None:
@@ -166,8 +169,18 @@ class FrameMaker:
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
         self._at_once = min(AT_ONCE[select()], UNDER_WAY // pixels)
+        self._encode = self._encoding(pixels)
 
-    def make(self, specs: Sequence[FrameSpec]) -> Iterator[str]:
+    def _encoding(self, pixels: int) -> Callable[[TracedFrame], str]:
+        """What writes a frame of so many pixels, on any thread."""
+        encoder = FrameEncoder(self._job.writer, self._job.camera, self._job.seed)
+        if self._job.threads == 1 or pixels < PROCESSES_FROM[select()]:
+            return encoder.write
+        processes = EncoderProcesses(encoder)
+        weakref.finalize(self, processes.close)
+        return processes.write
+
+    def make(self, specs: Iterable[FrameSpec]) -> Iterator[str]:
         """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.
 
         The first error, of rendering or writing, ends it: what is being written then is finished first.
@@ -184,7 +197,7 @@ class FrameMaker:
             finally:
                 pool.shutdown(cancel_futures=True)
 
-    def _rendered(self, specs: Sequence[FrameSpec]) -> Iterator[tuple[FrameSpec, Truth | None]]:
+    def _rendered(self, specs: Iterable[FrameSpec]) -> Iterator[tuple[FrameSpec, Truth | None]]:
         """Frames with their truth, None of those that are whole on disk, in order; some are under way at once. The
         first error comes after the frames before it."""
         under_way: deque[_FrameUnderWay] = deque()
@@ -201,7 +214,7 @@ class FrameMaker:
 
     def _steps(self, spec: FrameSpec) -> Steps[Truth | None]:
         """Of a frame's truth."""
-        if self._writer.has_frame(spec.name):
+        if self._has_frame(spec.name):
             return None
         seed, background = (self._job.seed, spec.index), None
         if self._background is not None:
@@ -217,8 +230,4 @@ class FrameMaker:
     def _write(self, spec: FrameSpec, truth: Truth | None) -> str:
         if truth is None:
             return spec.name
-        seed, behind = (self._job.seed, spec.index), truth.radiance_background
-        camera = self._job.camera if spec.exposure is None else replace(self._job.camera, exposure=spec.exposure)
-        recording = record_image(truth.radiance, truth.alpha, camera, seed, behind)
-        self._writer.write_frame(spec.name, truth, recording.image, recording.raw)
-        return spec.name
+        return self._encode(TracedFrame(spec.name, spec.index, spec.exposure, truth))

@@ -8,15 +8,15 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spacesim.data.images.tone import display_values
 from spacesim.data.records import Camera, Sun
+from spacesim.processes import connect_to_parent
 from spacesim.scenes.config import CameraConfig, SceneConfig
-from spacesim.scenes.generation.workers import connect_to_parent, select_backend
+from spacesim.scenes.generation.workers import select_backend
 from spacesim.viewer.drawing.paint import Planes
 
 if TYPE_CHECKING:
@@ -113,9 +113,9 @@ def _label_planes(labels: dict[str, np.ndarray], models: Sequence[int]) -> Plane
     )
 
 
-def _work(connection: Connection) -> None:
-    """What the process does."""
-    inbox, tell = connect_to_parent(connection)
+def main(socket: int) -> None:
+    """Answer requests that come through a socket, for ever."""
+    inbox, tell = connect_to_parent(socket)
     name, threads = inbox.get()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
@@ -138,8 +138,3 @@ def _work(connection: Connection) -> None:
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             tell(TraceResult(request.number, None, 0, True, reason))
-
-
-def main(socket: int) -> None:
-    """Answer requests that come through a socket, for ever."""
-    _work(Connection(socket))

@@ -2,16 +2,11 @@
 
 import logging
 import os
-import socket
-import subprocess
-import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +17,14 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
+from spacesim.processes import ChildProcess, end
 from spacesim.viewer.drawing.paint import Bytes, Planes
 from spacesim.viewer.state import SceneState, ViewerCamera
+from spacesim.viewer.truth import tracer
 from spacesim.viewer.truth.tracer import TraceRequest, TraceResult, model_ids
 
 SIDE = 512  #: pixels of the longer side of what is path-traced, at most
 SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one
-PATIENCE = 2.0  #: seconds in which the process ends after it is asked to
-_START = "import sys; from spacesim.viewer.truth import tracer; tracer.main(int(sys.argv[1]))"
-_ROOT = str(Path(__file__).parents[3])
 
 _log = logging.getLogger(__name__)
 
@@ -118,8 +112,7 @@ class TraceQueue:
         self._waiting: OrderedDict[Hashable, TraceRequest] = OrderedDict()
         self._running: tuple[Hashable, TraceRequest] | None = None
         self._lock = threading.RLock()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Connection | None = None
+        self._child: ChildProcess | None = None
         self._count = 0
         self._stopped = False
 
@@ -148,17 +141,9 @@ class TraceQueue:
             self._stopped = True
             self._waiting.clear()
             self._running = None
-            process, connection = self._process, self._connection
-            self._process = self._connection = None
-        if connection is not None:
-            with suppress(OSError):
-                connection.close()
-        if process is not None:
-            try:
-                process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            child, self._child = self._child, None
+        if child is not None:
+            end([child])
 
     def _pump(self) -> bool:
         """Send the next request, if the process is free and there is one. The lock is held."""
@@ -171,32 +156,22 @@ class TraceQueue:
         return True
 
     def _send(self, request: TraceRequest | None) -> None:
-        if self._connection is not None:
+        if self._child is not None:
             with suppress(OSError, ValueError):  # where it is dead, the listener says so
-                self._connection.send(request)
+                self._child.send(request)
 
     def _start(self) -> None:
-        if self._process is not None:
+        if self._child is not None:
             return
-        ours, theirs = socket.socketpair()
-        paths = [_ROOT, *filter(None, [os.environ.get("PYTHONPATH")])]
-        with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _START, str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-                start_new_session=True,  # Ctrl-C reaches the viewer alone, which then ends it
-            )
-        self._connection = Connection(ours.detach())
-        self._connection.send((backend.select(), max(1, (os.cpu_count() or 2) // 2)))
-        threading.Thread(target=self._listen, args=(self._connection, self._process), daemon=True).start()
+        self._child = ChildProcess(tracer.__name__)
+        self._child.send((backend.select(), max(1, (os.cpu_count() or 2) // 2)))
+        threading.Thread(target=self._listen, args=(self._child,), daemon=True).start()
 
-    def _listen(self, connection: Connection, process: subprocess.Popen[bytes]) -> None:
+    def _listen(self, child: ChildProcess) -> None:
         """Hand on answers until the process has gone."""
         while True:
             try:
-                answer = connection.recv()
+                answer = child.receive()
             except Exception:  # closed, or what no answer is
                 break
             with self._lock:
@@ -208,13 +183,13 @@ class TraceQueue:
             if fits and running is not None:
                 self._deliver(running[0], answer)
         with self._lock:
-            if self._connection is not connection:
+            if self._child is not child:
                 return  # ended by `stop`
             running, self._running = self._running, None
-            self._process = self._connection = None
-        code = process.wait()
+            self._child = None
+        ending = child.ending()
         if running is not None:
-            reason = f"the process that traces ended (code {code})"
+            reason = f"the process that traces {ending}"
             self._deliver(running[0], TraceResult(running[1].number, None, 0, True, reason))
         with self._lock:
             self._pump()

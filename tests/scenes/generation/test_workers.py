@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,13 +40,14 @@ def job(tmp_path) -> tuple[Job, list[FrameSpec]]:
     return replace(sweep.job, root=tmp_path), sweep.specs
 
 
-def workers_of(parent: int) -> list[int]:
-    """Process ids of the workers that a process has started."""
+def workers_of(parent: int, module: str = "workers") -> list[int]:
+    """Process ids of the workers, or the encoders, that a process has started."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            if int(fields[1]) == parent and b"spacesim.scenes.generation.workers" in (folder / "cmdline").read_bytes():
+            name = f"spacesim.scenes.generation.{module}".encode()
+            if int(fields[1]) == parent and name in (folder / "cmdline").read_bytes():
                 found.append(int(folder.name))
         except OSError:
             continue
@@ -109,7 +111,7 @@ def test_workers_end_with_their_parent_and_resume_completes(whole, tmp_path, end
 
 def test_frames_that_kill_every_process_end_in_a_sentence(job, monkeypatch):
     work, specs = job
-    monkeypatch.setattr("spacesim.scenes.generation.workers.sys.executable", "/bin/false")
+    monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(WorkError, match=r"train_00000 to train_00000: 3 processes ended .* code 1.* fewer workers"):
         list(make_in_processes(work, specs, 1))
 
@@ -163,23 +165,69 @@ def test_an_error_comes_after_the_frames_before_it(job, monkeypatch, step):
     assert made == [0, 1]
 
 
+@pytest.fixture
+def encoding(job, monkeypatch) -> tuple[Job, list[FrameSpec]]:
+    """A job whose frames are encoded in two processes."""
+    monkeypatch.setattr(frames, "PROCESSES_FROM", dict.fromkeys(frames.PROCESSES_FROM, 0))
+    work, specs = job
+    return replace(work, threads=2), specs
+
+
+@needs_proc
+def test_processes_encode_the_same_bytes_and_may_die(encoding, tmp_path, monkeypatch):
+    work, specs = encoding
+    maker = FrameMaker(work)
+    made = maker.make(specs)
+    names = [next(made), next(made)]
+    started = workers_of(os.getpid(), "encoders")
+    assert len(started) == 2
+    os.kill(started[0], signal.SIGKILL)
+    assert [*names, *made] == [spec.name for spec in specs]
+    assert started[0] not in workers_of(os.getpid(), "encoders")
+    del maker, made
+    assert not any(alive(process) for process in workers_of(os.getpid(), "encoders"))
+    monkeypatch.undo()
+    one = replace(work, root=tmp_path / "one")
+    list(FrameMaker(one).make(specs))
+    written = contents(tmp_path)
+    assert {key: value for key, value in written.items() if not key.startswith("one/")} == contents(one.root)
+
+
+def test_an_error_in_an_encoder_is_raised_unchanged(encoding, tmp_path):
+    work, specs = encoding
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match=r"file/data/.*cannot be written"):
+        list(FrameMaker(replace(work, root=tmp_path / "file/data")).make(specs))
+
+
+def test_a_frame_that_kills_every_encoder_ends_in_a_sentence(encoding, monkeypatch):
+    work, specs = encoding
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(WorkError, match=r"train_0000\d: 3 processes ended while they wrote it, the last ended with"):
+        list(FrameMaker(work).make(specs))
+
+
 class _Obliging:
-    """A connection to a worker that makes all that it is given at once."""
+    """A process that makes all that it is given at once, and its connection."""
 
     def __init__(self) -> None:
         self.answers: list[str | None] = [None]
 
+    @property
+    def connection(self) -> "_Obliging":
+        return self
+
     def send(self, specs: list[FrameSpec]) -> None:
         self.answers += [*(spec.name for spec in specs), None]
 
-    def recv(self) -> str | None:
+    def receive(self) -> str | None:
         return self.answers.pop(0)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypatch, count):
     def start(_job: Job, task: Any, *_: int) -> workers._Worker:
-        return workers._Worker(None, _Obliging(), task, [task.specs])
+        return workers._Worker(_Obliging(), deque([task]), [task.specs])
 
     def all_that_spoke(connections: list[_Obliging]) -> list[_Obliging]:
         spoke = [connection for connection in connections if connection.answers]
@@ -187,7 +235,7 @@ def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypa
         return spoke
 
     monkeypatch.setattr(workers, "_start", start)
-    monkeypatch.setattr(workers, "_stop", lambda _workers: None)
+    monkeypatch.setattr(workers, "end", lambda _processes: None)
     monkeypatch.setattr(workers, "wait", all_that_spoke)
     work, specs = job
     assert sorted(make_in_processes(work, specs, count)) == sorted(spec.name for spec in specs)
