@@ -55,7 +55,7 @@ class EncoderProcesses:
         for _ in range(ATTEMPTS):
             process = self._take()
             try:
-                process.send(frame)
+                process.lend(frame)
                 answer = process.receive()
             except (EOFError, OSError):
                 ending = process.ending()

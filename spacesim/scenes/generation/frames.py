@@ -34,7 +34,7 @@ AT_ONCE = {"cuda": 4, "llvm": 1}
 """Frames under way beside the newest, at most: the device traces paths of one while the host reads others."""
 UNDER_WAY = 1 << 21
 """Pixels of these: each holds about 100 bytes of the device's."""
-MAX_THREADS = 16
+MAX_THREADS = 32
 PROCESSES_FROM = {"cuda": 1 << 16, "llvm": math.inf}
 """Pixels of frames from which processes encode, if there may be several: on a CPU rendering leaves them no core."""
 IN_FLIGHT = 1 << 30
@@ -167,7 +167,7 @@ class FrameMaker:
         if job.background is not None:
             self._background = Background(job.background, job.scene, job.camera.distortion, job.seed)
         pixels = math.prod(job.camera.resolution)
-        self._most = max(1, min(job.threads + 1, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
+        self._most = max(1, min(2 * job.threads, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
         self._at_once = min(AT_ONCE[select()], UNDER_WAY // pixels)
         self._encode = self._encoding(pixels)
 
