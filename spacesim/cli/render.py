@@ -17,7 +17,7 @@ SUMMARY, NEEDS_BACKEND = "one picture of a run", True
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("path", type=Path, metavar="RUN")
-    of_exr = "EXR: numbers; rgb sRGB values, of light.radiance linear ones"
+    of_exr = "EXR: numbers; rgb sRGB values, of light.linear linear ones"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.exr", help=of_exr)
     add_view(parser)
     of_sun = "degrees; none: the Earth's light alone; a vanilla run knows one light only"

@@ -28,7 +28,7 @@ class Prediction:
     visibility: np.ndarray | None  #: [H, W], or None from a method without
     #: [H, W, 3] unit vectors in world axes, 0 where there is no surface, or None where not asked for
     normal: np.ndarray | None = None
-    #: [H, W, 3] linear display values over black, not clipped; None of a run that does not learn radiance
+    #: [H, W, 3] linear display values over black, not clipped; None of a run whose colours are sRGB values
     linear: np.ndarray | None = field(default=None, kw_only=True)
     tone: Tone = field(default="srgb", kw_only=True)  #: the curve by which linear light is shown in `rgb`
 

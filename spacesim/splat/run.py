@@ -332,9 +332,9 @@ def stops(curve: Curve | None, exposure: float | None, source: str) -> float:
     return exposure - curve.exposure
 
 
-def display_light(light: np.ndarray, curve: Curve, stops: float = 0.0) -> np.ndarray | None:
+def display_light(light: np.ndarray, curve: Curve, stops: float = 0.0) -> np.ndarray:
     """`Prediction.linear` of a picture [H, W, 3] of linear colours. stops: as in `adjust_exposure`"""
-    return np.float32(curve.white * 2.0**stops) * light if curve.reaches_beyond_white else None
+    return np.float32(curve.white * 2.0**stops) * light
 
 
 def draw_lit(

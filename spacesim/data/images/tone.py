@@ -31,11 +31,6 @@ class Curve(NamedTuple):
     exposure: float  #: EV of the pictures trained on
     white: float  #: linear display value of a colour of 1: of `WHITES`, or PEAK
 
-    @property
-    def reaches_beyond_white(self) -> bool:
-        """Whether colours are of light that pictures clip."""
-        return self.white > WHITES[self.tone]
-
 
 def tone_and_exposure(scene: JsonMapping) -> tuple[Tone, float] | None:
     """(tone curve, exposure in EV) of a dataset's pictures, by its scene.json; None where that does not say."""

@@ -76,7 +76,7 @@ class DrawnView:
 
     def light(self, stops: float = 0.0) -> np.ndarray | None:
         """See `Prediction.linear`. stops: as of `image`"""
-        if self.curve is None or not self.curve.reaches_beyond_white or "rgb" not in self.planes:
+        if self.curve is None or "rgb" not in self.planes:
             return None
         colors = planes_image(self.planes["rgb"], self.output.width, self.output.height)
         return display_light(colors, self.curve, stops)

@@ -2,7 +2,7 @@
 
 OUT/sweep.png   pictures evenly chosen, each with its Sun in numbers and on a map of the sky
 OUT/sweep.mp4   all pictures, where there is an encoder
-OUT/frames/*    each picture as it was rendered, where asked for; of runs that learned radiance an EXR of light, too
+OUT/frames/*    each picture as it was rendered, where asked for; of runs in linear light an EXR, too
 """
 
 import math

@@ -200,7 +200,6 @@ def test_a_run_shows_light_beyond_white(small_lit_dataset, tmp_path):
     run = train(dataset, tmp_path / "run", config(shadow=ShadowConfig()))
     assert json.loads((run.path / "config.json").read_text())["light"]["radiance"] is True
     assert run.curve == ("filmic", 2.0, PEAK)
-    assert run.curve.reaches_beyond_white
     seen = run.predict(frame.camera, frame.sun)
     np.testing.assert_allclose(seen.rgb, display_values(seen.linear, "filmic"), atol=1e-5)
     darker = run.predict(frame.camera, frame.sun, exposure=0.0)
@@ -221,13 +220,18 @@ def test_a_run_shows_light_beyond_white(small_lit_dataset, tmp_path):
     assert not list((tmp_path / "shadows").rglob("*.exr"))
 
 
-def test_a_run_of_pictures_shows_none(small_lit_dataset, tmp_path):
-    light = LightConfig(FIELD, linear=True)
+@pytest.mark.parametrize("linear", [True, False])
+def test_a_run_of_pictures_shows_light_if_it_has_any(small_lit_dataset, tmp_path, linear):
+    light = LightConfig(FIELD, linear=linear)
     run, frame = train(small_lit_dataset, tmp_path / "run", replace(config(), light=light)), small_lit_dataset.test[0]
     seen = run.predict(frame.camera, frame.sun)
-    assert seen.linear is None
+    assert (seen.linear is not None) == linear
     write_picture(seen, "rgb", tmp_path / "seen.exr")
-    np.testing.assert_array_equal(read_exr(tmp_path / "seen.exr")["rgb"], seen.rgb)
+    layers = read_exr(tmp_path / "seen.exr")
+    if linear:
+        np.testing.assert_allclose(display_values(layers["linear"], "srgb"), seen.rgb, atol=1e-5)
+    else:
+        np.testing.assert_array_equal(layers["rgb"], seen.rgb)
 
 
 def test_training_learns_what_pictures_clip(small_lit_dataset, tmp_path):
