@@ -19,7 +19,7 @@ from spacesim.viewer.network.message_filter import has_pending_files
 from spacesim.viewer.panels.controls import ClientControls, SunControls
 from spacesim.viewer.panels.handles import FRUSTUM, HANDLES, add_frusta
 from spacesim.viewer.session import Session, Statistics
-from spacesim.viewer.state import SharedScene, ViewerCamera, parse_viewer_camera
+from spacesim.viewer.state import DisplaySettings, SharedScene, ViewerCamera, parse_viewer_camera
 from spacesim.viewer.truth.source import TruthService
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Client:
         self._closed = False
         self.session = Session(renderer, shared, loop, self, truth)
         frames = len(dataset.frames) if dataset else 0
-        self.controls = ClientControls(handle.gui, self.session, self, facts, frames, renderer.modes)
+        self.controls = ClientControls(handle.gui, self.session, self, facts, frames, renderer)
 
     def begin(self, place: ArrayLike, fov: float) -> None:
         """Draw for it from now on. place, fov: [3] metres and vertical, radians, where it looks from at first"""
@@ -125,9 +125,9 @@ class Client:
 
     def save_picture(self) -> None:
         """See `Actions`."""
-        view, mode = self.session.view, self.session.settings.mode
+        view, settings = self.session.view, self.session.settings
         if view is not None and not self._closed:
-            self._loop.submit(lambda: self._send_picture(view, mode), (self, "picture"))
+            self._loop.submit(lambda: self._send_picture(view, settings), (self, "picture"))
 
     def look_from(self, world_from_camera: np.ndarray, fov: float) -> None:
         """Move the client's camera to a pose [4, 4]; it goes round what is in the middle of the scene then."""
@@ -142,14 +142,15 @@ class Client:
             camera.wxyz = tuple(quaternion_from_rotation(world_from_camera[:3, :3]))
             camera.fov = float(fov)
 
-    def _send_picture(self, view: ViewerCamera, mode: str) -> None:
+    def _send_picture(self, view: ViewerCamera, settings: DisplaySettings) -> None:
         """On the render thread: with square pixels, as large as the window; none while another is on its way."""
         if has_pending_files(self.handle._websock_connection):
             return
         scale = min(1.0, MAX_PICTURE_SIDE / max(view.width, view.height))
         width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
         camera, give_way = view.camera(width, height), self._loop.give_way
-        _, picture, depths, _ = draw_mode(self._renderer, self._shared.state, camera, mode, give_way)
+        state, mode, exposure = self._shared.state, settings.mode, settings.exposure
+        _, picture, depths, _ = draw_mode(self._renderer, state, camera, mode, give_way, exposure)
         file = io.BytesIO()
         Image.fromarray(add_color_bar(picture, depths) if depths else picture).save(file, "PNG")
         if not self._closed:

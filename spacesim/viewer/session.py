@@ -107,7 +107,7 @@ class Session:
         with self._lock:
             before, self._settings = self._settings, replace(self._settings, **changes)
             after = self._settings
-            if (before.mode, before.samples) != (after.mode, after.samples) or after.compare == "off":
+            if before.of_truth != after.of_truth or after.compare == "off":
                 self._drop_truth()
         if before != after:
             self._request_frame(moving=False)
@@ -190,8 +190,8 @@ class Session:
         with self._lock:
             if self._closed or not full:
                 return self._closed
-            now = self._view, self._settings.mode, self._settings.side
-        return now != (view, settings.mode, settings.side) or not state.same(self._shared.state)
+            now = self._view, self._settings.of_picture
+        return now != (view, settings.of_picture) or not state.same(self._shared.state)
 
     def _reusable_frame(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> ViewerFrame | None:
         """The last picture kept, if it is this one but for its resolution and the comparison with the truth."""
@@ -199,7 +199,7 @@ class Session:
         if last is None:
             return None
         last_view, last_state, last_settings, frame = last
-        same = (last_settings.mode, last_settings.side) == (settings.mode, settings.side)
+        same = last_settings.of_picture == settings.of_picture
         return frame if same and view.same(last_view) and state.same(last_state) else None
 
     def _with_truth(
@@ -229,11 +229,8 @@ class Session:
 
     def _is_current(self, view: ViewerCamera, state: SceneState, settings: DisplaySettings) -> bool:
         """Whether a picture is still of what the client looks at; else the next one asks. The lock is held."""
-        as_asked = (settings.mode, settings.samples, settings.compare) == (
-            self._settings.mode,
-            self._settings.samples,
-            self._settings.compare,
-        )
+        now = self._settings
+        as_asked = (settings.of_truth, settings.compare) == (now.of_truth, now.compare)
         return view is self._view and state.same(self._shared.state) and as_asked
 
     def _report(self, frame: ViewerFrame, full: bool) -> None:

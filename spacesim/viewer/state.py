@@ -16,6 +16,7 @@ MATERIALS = ("albedo", "specular", "roughness", "metallic")  #: modes that show 
 MODES = ("colour", "depth", "accumulation", "visibility", "normals", *MATERIALS, "object id", "ellipsoids")
 COMPARISONS = ("off", "wipe", "beside", "difference")
 SIDES = (256, 512, 768, 1024, 1536, 2048)  #: pixels of a picture's longer side at rest that clients may choose
+EXPOSURES = (-8.0, 8.0)  #: EV
 MAX_WINDOW_SIDE = 8192  #: pixels a side of a client's window: more is nonsense
 FIELDS_OF_VIEW = (np.radians(0.01), np.radians(170.0))  #: vertical
 MAX_COORDINATE = 1e7  #: metres of a camera in each coordinate
@@ -82,6 +83,7 @@ class DisplaySettings:
     wipe: float = 0.5  #: share of the width that shows the truth
     side: int = 1024  #: most pixels of the longer side
     samples: int = 32  #: of the path tracer, a pixel
+    exposure: float = 0.0  #: EV more than in training, of colours in linear light
 
     def __post_init__(self) -> None:
         mode = self.mode if self.mode in MODES else MODES[0]
@@ -89,8 +91,19 @@ class DisplaySettings:
         changed = {"mode": mode, "compare": compare, "wipe": clamp(self.wipe, 0, 1, 0.5)}
         changed["side"] = int(clamp(self.side, SIDES[0], SIDES[-1], 1024))
         changed["samples"] = int(clamp(self.samples, 1, 4096, 32))
+        changed["exposure"] = clamp(self.exposure, *EXPOSURES, 0.0)
         for name, value in changed.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def of_picture(self) -> tuple[str, int, float]:
+        """What a picture without the truth depends on."""
+        return self.mode, self.side, self.exposure
+
+    @property
+    def of_truth(self) -> tuple[str, int, float]:
+        """What the truth depends on."""
+        return self.mode, self.samples, self.exposure
 
 
 def clamp(value: SupportsFloat | str, least: float, most: float, otherwise: float) -> float:

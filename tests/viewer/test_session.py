@@ -163,8 +163,10 @@ def test_why_there_is_no_truth_is_said(made):
     session.change_settings(mode="depth")  # asks again
     wait_for(lambda: source.asked == ["colour", "depth"], "the request")
     source.found = 7
-    session.change_settings(mode="normals")
+    session.change_settings(exposure=1.0)  # likewise
     wait_for(lambda: len(source.asked) == 3, "the request")
+    session.change_settings(mode="normals")
+    wait_for(lambda: len(source.asked) == 4, "the request")
     session.on_trace_result(TraceResult(7, None, 0, True, "the process that traces ended"))
     wait_for(lambda: "no truth: the process that traces ended" in screen.statistics[-1].status, "the reason")
 

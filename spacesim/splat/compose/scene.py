@@ -163,10 +163,15 @@ class GaussianComposition:
         """Whether the light of a Sun's Earth changes what is predicted."""
         return any(model.run.knows_earth for model in self.models)
 
+    @property
+    def curve(self) -> Curve | None:
+        """How its linear colours are shown; None where not all models are linear, of one curve and exposure."""
+        return self._ensemble.curve
+
     def stops(self, exposure: float | None) -> float:
         """By how many EV pictures are exposed more than those of training. exposure: EV, or None for theirs. Raises
         InputError where not all models are linear, of one tone curve and exposure, and for no such exposure."""
-        curve = self._ensemble.curve
+        curve = self.curve
         if exposure is not None and curve is None and any(member.curve for member in self._ensemble.members):
             raise InputError("exposure: expected models of one tone curve and exposure, found several")
         return stops(curve, exposure, str(self.path or self.models[0].run.path))

@@ -58,7 +58,7 @@ def draw_frame(
     start = time.perf_counter()
     camera = view.camera(*picture_size(view, settings.side, share))
     try:
-        planes, picture, depths, note = draw_mode(renderer, state, camera, settings.mode, on_chunk)
+        planes, picture, depths, note = draw_mode(renderer, state, camera, settings.mode, on_chunk, settings.exposure)
     except InputError as error:
         planes = Planes(np.zeros((camera.height, camera.width)))
         picture, depths, note = _black(camera), None, f"no picture: {error}"
@@ -71,13 +71,14 @@ def draw_mode(
     camera: Camera,
     mode: str,
     on_chunk: Callable[[], None] | None = None,
+    exposure: float = 0.0,
 ) -> tuple[Planes, Bytes, tuple[float, float] | None, str]:
     """(planes, picture, depths, note) of a camera in a mode; black, and a note that says why, where there is nothing of
-    the mode to see. on_chunk: see `SceneRenderer.draw`"""
+    the mode to see. on_chunk, exposure: see `SceneRenderer.draw`"""
     if mode not in renderer.modes:
         planes = Planes(np.zeros((camera.height, camera.width)))
         return planes, _black(camera), None, f"no {mode} to be seen: scenes of Gaussians alone have such"
-    planes = renderer.draw(state, camera, mode, on_chunk)
+    planes = renderer.draw(state, camera, mode, on_chunk, exposure)
     depths = depth_range(planes) if mode == "depth" else None
     picture = paint(planes, mode, depths)
     if picture is not None:

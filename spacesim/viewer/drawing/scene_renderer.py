@@ -43,6 +43,7 @@ class SceneRenderer:
     progressive: whether a picture takes so long that it comes in steps, of radiance fields
     modes: of `MODES`, those that there can be
     relightable: whether the Sun changes the picture
+    is_linear: whether an exposure does: colours are linear light
     backend: that draws
     """
 
@@ -54,6 +55,7 @@ class SceneRenderer:
         self.progressive = not isinstance(composition, GaussianComposition)
         self.modes = tuple(mode for mode in MODES if mode not in OF_GAUSSIANS or not self.progressive)
         self.relightable = composition.relightable
+        self.is_linear = not self.progressive and composition.curve is not None
         self.backend = composition.backend
         names = _unique_names([placed.name or placed.run.path.resolve().name for placed in composition.models])
         self.models = tuple(
@@ -71,9 +73,17 @@ class SceneRenderer:
         centre = spheres[0][0] if len(spheres) == 1 else 0.5 * (low + high)
         return centre, max(float(np.linalg.norm(at - centre) + radius) for at, radius in spheres)
 
-    def draw(self, state: SceneState, camera: Camera, mode: str, on_chunk: Callable[[], None] | None = None) -> Planes:
+    def draw(
+        self,
+        state: SceneState,
+        camera: Camera,
+        mode: str,
+        on_chunk: Callable[[], None] | None = None,
+        exposure: float = 0.0,
+    ) -> Planes:
         """The planes that a mode needs, and alpha. on_chunk: called now and then within a picture of a `progressive`
-        scene, which an exception ends. Raises InputError where the Sun matters and none is given."""
+        scene, which an exception ends; exposure: EV more than in training, of one that `is_linear`. Raises InputError
+        where the Sun matters and none is given."""
         scene = self.composition.posed(state.poses)
         if self.progressive:
             seen = scene.predict(camera, state.sun, normals=NEEDED[mode] == "normal", on_chunk=on_chunk)
@@ -93,7 +103,7 @@ class SceneRenderer:
         alpha = drawn.image("alpha")
         if name not in outputs or (name == "visibility" and "visibility" not in drawn.planes):
             return Planes(alpha)
-        return Planes(alpha, **{name: drawn.image(outputs[name])})
+        return Planes(alpha, **{name: drawn.image(outputs[name], exposure)})
 
     def why_missing(self, plane: str) -> str:
         """Why a plane cannot be had, in words."""

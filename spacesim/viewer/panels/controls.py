@@ -10,7 +10,7 @@ from spacesim.viewer.drawing.paint import color_bar_html
 from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.panels.handles import Gizmos, SunHandle
 from spacesim.viewer.session import Session, Statistics
-from spacesim.viewer.state import COMPARISONS, MODES, SIDES, SceneState, SharedScene, clamp
+from spacesim.viewer.state import COMPARISONS, EXPOSURES, MODES, SIDES, SceneState, SharedScene, clamp
 
 if TYPE_CHECKING:
     import viser
@@ -138,15 +138,18 @@ class ClientControls:
         actions: Actions,
         facts: Sequence[str],
         frames: int,
-        modes: tuple[str, ...] = MODES,
+        renderer: SceneRenderer,
     ) -> None:
         self._facts = facts
         self._session = session
         with gui.add_folder("View", order=1):
-            self.mode = gui.add_dropdown("Mode", modes, initial_value=MODES[0])
+            self.mode = gui.add_dropdown("Mode", renderer.modes, initial_value=MODES[0])
             self.scale = gui.add_html("", visible=False)
             sizes = tuple(map(str, SIDES))
             side = gui.add_dropdown("Resolution", sizes, initial_value="1024", hint="most pixels a side, at rest")
+            if renderer.is_linear:
+                exposure = gui.add_slider("Exposure", *EXPOSURES, 0.1, 0.0, hint="EV more than in training")
+                exposure.on_update(_call(lambda: session.change_settings(exposure=exposure.value)))
             picture = gui.add_button("Picture (PNG)")
         with gui.add_folder("Truth", order=4):
             self.compare = gui.add_dropdown("Compare", COMPARISONS, initial_value=COMPARISONS[0])

@@ -22,6 +22,7 @@ from spacesim.viewer.drawing.paint import Planes
 if TYPE_CHECKING:
     from spacesim.scenes.render import Renderer
 
+OF_COLOUR = "colour", "ellipsoids", "accumulation"  #: modes that ask for paths, the others for labels
 PASS = 4  #: samples a pixel between two answers
 NICENESS = 10  #: less urgent than the viewer's own pictures
 
@@ -35,8 +36,9 @@ class TraceRequest:
     camera: Camera  #: pose and intrinsics
     sun: Sun  #: that lights it; the Earth that it names hides it where the scene has none
     samples: int  #: a pixel
-    mode: str  #: whose planes: "colour" asks for paths, the others for labels
+    mode: str  #: whose planes
     models: Sequence[int] = ()  #: see `model_ids`
+    exposure: float = 0.0  #: EV more than the scene's
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ class Tracer:
         renderer = self._loaded(request.scene)
         camera, sun, config = request.camera, request.sun, request.scene.camera
         left = sun.visible_share if request.scene.earth is None else 1.0  # a scene's own Earth is traced
-        if request.mode not in ("colour", "ellipsoids", "accumulation"):
+        if request.mode not in OF_COLOUR:
             labels = renderer.labels(camera, sun)
             labels["sun_visibility"] = np.float32(left) * labels["sun_visibility"]
             yield TraceResult(request.number, _label_planes(labels, request.models), 1, True)
@@ -72,7 +74,7 @@ class Tracer:
             radiance, alpha = renderer.radiance(camera, sun, (request.scene.seed, done))
             total, weight, done = total + radiance.astype(np.float64), weight + alpha.astype(np.float64), done + PASS
             share = PASS / done
-            planes = _picture(left * total * share, weight * share, config)
+            planes = _picture(2.0**request.exposure * left * total * share, weight * share, config)
             yield TraceResult(request.number, planes, done, done >= request.samples)
 
     def _loaded(self, scene: SceneConfig) -> "Renderer":

@@ -21,7 +21,7 @@ from spacesim.processes import ChildProcess, end
 from spacesim.viewer.drawing.paint import Bytes, Planes
 from spacesim.viewer.state import SceneState, ViewerCamera
 from spacesim.viewer.truth import tracer
-from spacesim.viewer.truth.tracer import TraceRequest, TraceResult, model_ids
+from spacesim.viewer.truth.tracer import OF_COLOUR, TraceRequest, TraceResult, model_ids
 
 SIDE = 512  #: pixels of the longer side of what is path-traced, at most
 SAME_DIRECTION = 1e-4  #: radians between two Suns or two axes that count as one
@@ -62,7 +62,7 @@ def stored_truth(dataset: Dataset, number: int, mode: str, models: Sequence[int]
     frame = dataset.frames[number]
     source = f"the dataset's frame {number}"
     try:
-        if mode in ("colour", "ellipsoids", "accumulation"):
+        if mode in OF_COLOUR:
             image = load_image(dataset, frame)
             rgb = image.over(np.zeros(3)).astype(np.float32)
             return ViewerTruth(Planes(image.alpha, rgb=rgb), frame.camera, source)

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import made_run
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import srgb_from_linear
+from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera
 from spacesim.eval.pictures import error_colors
 from spacesim.learning.pictures import LIT, SHADOWED
-from spacesim.splat.compose import GaussianComposition, Pose
+from spacesim.splat.compose import GaussianComposition, PlacedRun, Pose
 from spacesim.viewer.drawing.frames import (
     BUDGET,
     MIN_SIDE,
@@ -49,6 +50,20 @@ def pixel(frame, view, point):
     camera = view.camera(width, height)
     x, y, z = camera.camera_from_world[:3, :3] @ point + camera.camera_from_world[:3, 3]
     return frame.picture[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx)].astype(int)
+
+
+def test_colours_in_linear_light_are_exposed(renderer, state, view):
+    below = SceneRenderer(GaussianComposition([PlacedRun(made_run("linear"), Pose())]))
+    stand = SceneState((Pose(),), state.sun)
+    assert (below.is_linear, renderer.is_linear) == (True, False)
+    camera = view.camera(64, 48)
+    dark, light = (below.draw(stand, camera, "colour", exposure=exposure).rgb for exposure in (-1.0, 0.0))
+    assert light.max() > 0.2
+    np.testing.assert_allclose(linear_from_srgb(dark), linear_from_srgb(light) / 2, atol=1e-5)
+    pictures = [draw_frame(below, stand, view, DisplaySettings(side=256, exposure=ev)).picture for ev in (-1.0, 0.0)]
+    assert pictures[0].mean() < 0.9 * pictures[1].mean()
+    depths = [draw_frame(below, stand, view, DisplaySettings("depth", side=256, exposure=ev)) for ev in (-1.0, 0.0)]
+    assert np.array_equal(depths[0].picture, depths[1].picture)
 
 
 def test_colors_are_where_the_models_are(renderer, state, view):
@@ -226,8 +241,8 @@ def test_invalid_views_are_dropped(field, value):
 
 
 def test_invalid_display_settings_become_valid():
-    settings = DisplaySettings("no such mode", "sideways", float("nan"), 10**9, "many")
-    assert settings == DisplaySettings("colour", "off", 0.5, 2048, 32)
+    settings = DisplaySettings("no such mode", "sideways", float("nan"), 10**9, "many", 99)
+    assert settings == DisplaySettings("colour", "off", 0.5, 2048, 32, 8.0)
     assert DisplaySettings(wipe=7).wipe == 1
     assert DisplaySettings(side=-4).side == 256
     assert clamp("x", 0, 1, 0.25) == 0.25

@@ -78,7 +78,15 @@ def test_the_tracer_renders_what_the_data_hold(tiny_data, scene):
     assert [(a.samples, a.done) for a in answers] == [(PASS, False), (2 * PASS, False), (3 * PASS, True)]
     colors = stored_truth(dataset, 0, "colour").planes.rgb
     assert np.abs(answers[0].planes.rgb - colors).max() < 0.6 / 255  # as many samples, the same seed
-    *_, many = tracer.answers(TraceRequest(3, scene, frame.camera, frame.sun, 16 * PASS, "colour"))
+    dark, light = linear_from_srgb(answers[0].planes.rgb), []
+    for exposure in (-1.0, 0.5):
+        asked = TraceRequest(3, scene, frame.camera, frame.sun, PASS, "colour", exposure=exposure)
+        light.append(linear_from_srgb(next(tracer.answers(asked)).planes.rgb))
+    below_white = (answers[0].planes.alpha[..., None] == 1) & (light[1] < 0.99)
+    assert below_white.sum() > 100
+    np.testing.assert_allclose(light[0][below_white], dark[below_white] / 2, atol=1e-4)
+    np.testing.assert_allclose(light[1][below_white], dark[below_white] * 2**0.5, atol=1e-4)
+    *_, many = tracer.answers(TraceRequest(4, scene, frame.camera, frame.sun, 16 * PASS, "colour"))
     errors = [np.abs(a.planes.rgb - many.planes.rgb).mean() for a in answers]
     assert 0 < errors[2] < errors[1] < errors[0]
 
