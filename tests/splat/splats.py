@@ -5,7 +5,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
-from spacesim.splat.raster import adjoint, blend, records
+from spacesim.splat.raster import adjoint, blend, records, walks
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import tiles
@@ -14,7 +14,7 @@ from spacesim.splat.train.strategies.strategy import OnScreen
 
 def take_cudas(monkeypatch) -> None:
     """CUDA's way of drawing, on the backend that runs."""
-    for module in (binning, tiles, records, adjoint, blend):
+    for module in (binning, tiles, records, adjoint, blend, walks):
         monkeypatch.setattr(module, "select", lambda: "cuda")
 
 

@@ -12,9 +12,9 @@ from typing import cast
 import drjit as dr
 
 from spacesim.backend import ad, recorded, select
-from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.arrays import Bool, Float, NumberT, UInt32
 from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
-from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -22,12 +22,14 @@ from spacesim.splat.raster.records import (
     TRANSMITTANCE_MIN,
     BlendResult,
     BlendState,
+    ListedRecords,
     bucket_numbers,
     exp2,
     exponents,
     list_records,
     store,
 )
+from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lists
 
 BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
@@ -65,14 +67,44 @@ def blend_lists(
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
     adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
-    shape, tiles = lists.shape, lists.tiles_x * lists.tiles_y
-    channels, pixels = len(features), lists.shape.pixels
-    turn = TURN[select()]
-    assert not bucket or bucket % turn == 0, "a bucket is some turns of the loop"
+    shape, channels = lists.shape, len(features)
+    assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
     records = list_records(splats, features, lists, capacity, packed)
-    thread = thread_pixels(lists)
-    start, end = (dr.gather(ad.UInt32, bounds, thread.tile) for bounds in (lists.start, lists.end))
-    snapshots = _Checkpoints(lists, bucket, channels, thread.place, start, end) if bucket else None
+    walks = whole_lists(lists, channels)
+    if cut := are_in_parts(lists, capacity):
+        walks = in_parts(lists, channels, lambda first: _walk(lists, records, first)[:2])
+    snapshots = _Checkpoints(lists, bucket, channels, walks) if bucket else None
+    transmittance, sums, last = _walk(lists, records, walks, snapshots)
+    transmittance, thread = [dr.abs(value) for value in transmittance], walks.thread
+    planes = [dr.empty(ad.Float, width * height) for _ in range(1 + channels)]
+    if cut:  # where a list is empty, nobody writes
+        planes = [dr.full(ad.Float, float(c == 0), width * height) for c in range(1 + channels)]
+    for p, (i, j) in enumerate(thread_offsets(shape)):
+        column, row = thread.column + i, thread.row + j
+        inside = walks.writes[p] & (column < width) & (row < height)
+        for plane, value in zip(planes, [transmittance[p], *sums[p]], strict=True):
+            dr.scatter(plane, value, row * width + column, inside, dr.ReduceMode.NoConflicts)
+    kept = None
+    if bucket is not None:
+        kept = BlendState(
+            transmittance=_of_pixels(transmittance, lists, walks, 1, cut),
+            last=_of_pixels(last, lists, walks, 0, cut),
+            records=records,
+            bucket=bucket,
+            checkpoints=snapshots.states if snapshots else [],
+            bucket_tile=snapshots.tile if snapshots else None,
+            bucket_reached=snapshots.reached if snapshots else None,
+        )
+    dr.eval(planes, kept)
+    return BlendResult(planes[1:], planes[0], kept)
+
+
+def _walk(
+    lists: TileLists, records: ListedRecords, walks: Walks, snapshots: "_Checkpoints | None" = None
+) -> tuple[list[Float], list[list[Float]], list[UInt32]]:
+    """Of each pixel of each thread: what passes, negative where it is finished; sums; one past the last pair blended,
+    at least where a walk goes on."""
+    shape, turn, thread = lists.shape, TURN[select()], walks.thread
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) > 0)
@@ -87,74 +119,55 @@ def blend_lists(
             listed = k + u < end if u else ad.Bool(True)
             record = records.load(lists, k + u, listed)
             powers = exponents(record, thread.x, thread.y, shape)
-            for p in range(pixels):
+            for p in range(shape.pixels):
                 alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
                 reached = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > 0)
                 weight = alpha * transmittance[p]
                 behind = transmittance[p] - weight
-                blends = reached & (behind > TRANSMITTANCE_MIN)
+                blends = reached & ((behind > TRANSMITTANCE_MIN) | ~walks.finishes[p])
                 weight = dr.select(blends, weight, 0)
-                for c in range(channels):
-                    sums[p][c] = dr.fma(weight, record[6 + c], sums[p][c])
+                for c, value in enumerate(sums[p]):
+                    sums[p][c] = dr.fma(weight, record[6 + c], value)
                 left = dr.select(blends, behind, -transmittance[p])  # finished: negative from then on
                 transmittance[p] = dr.select(reached, left, transmittance[p])
                 last[p] = dr.select(blends, k + (u + 1), last[p])
         return k + turn, end, transmittance, sums, last
 
-    state = (
-        start,
-        end,
-        [ad.Float(1) for _ in range(pixels)],
-        [[ad.Float(0) for _ in range(channels)] for _ in range(pixels)],
-        [ad.UInt32(0) for _ in range(pixels)],
-    )
+    state = walks.start, walks.end, walks.transmittance, walks.sums, [ad.UInt32(walks.last) for _ in walks.sums]
     if lists.capacity > 0:
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
-    _, _, transmittance, sums, last = state
-    transmittance = [dr.abs(value) for value in transmittance]
+    return state[2:]
 
-    threads = tiles * shape.threads
-    planes = [dr.empty(ad.Float, width * height) for _ in range(1 + channels)]
-    for p, (i, j) in enumerate(thread_offsets(shape)):
-        column, row = thread.column + i, thread.row + j
-        inside = (column < width) & (row < height)
-        for plane, value in zip(planes, [transmittance[p], *sums[p]], strict=True):
-            dr.scatter(plane, value, row * width + column, inside, dr.ReduceMode.NoConflicts)
-    kept = None
-    if bucket is not None:
-        kept = BlendState(
-            transmittance=store(transmittance, thread.place, threads),
-            last=store(last, thread.place, threads),
-            records=records,
-            bucket=bucket,
-            checkpoints=snapshots.states if snapshots else [],
-            bucket_tile=snapshots.tile if snapshots else None,
-            bucket_reached=snapshots.reached if snapshots else None,
-        )
-    dr.eval(planes, kept)
-    return BlendResult(planes[1:], planes[0], kept)
+
+def _of_pixels(values: list[NumberT], lists: TileLists, walks: Walks, otherwise: int, cut: bool) -> NumberT:
+    """[T * pixels of a tile] of those of the threads that say it; `otherwise` where lists are cut and none does."""
+    shape = lists.shape
+    threads = lists.tiles_x * lists.tiles_y * shape.threads
+    if not cut:
+        return store(values, walks.thread.place, threads)
+    target = dr.full(type(values[0]), otherwise, threads * shape.pixels)
+    for p, value in enumerate(values):
+        dr.scatter(target, value, walks.thread.place * shape.pixels + p, walks.writes[p], dr.ReduceMode.NoConflicts)
+    return target
 
 
 class _Checkpoints:
-    """What the blending loop keeps of pixels before each bucket, see `BlendState`.
+    """What the blending loop keeps of pixels before each bucket, see `BlendState`."""
 
-    thread (its place), start, end (of its list): [T * threads]"""
-
-    def __init__(
-        self, lists: TileLists, bucket: int, channels: int, thread: UInt32, start: UInt32, end: UInt32
-    ) -> None:
+    def __init__(self, lists: TileLists, bucket: int, channels: int, walks: Walks) -> None:
         numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
-        pixels = lists.shape.width * lists.shape.height
-        self.shape, self.bucket, self.start = lists.shape, bucket, start
+        pixels, thread = lists.shape.width * lists.shape.height, walks.thread.place
+        self.shape, self.bucket, self.start = lists.shape, bucket, walks.list_start
         self.tile_number, self.within = thread // lists.shape.threads, thread % lists.shape.threads
-        self.first = start // bucket + self.tile_number
+        self.first = walks.list_start // bucket + self.tile_number
         self.states = [dr.empty(ad.Float, 4 * numbers * pixels) for _ in range(fours)]
         self.reached = dr.zeros(ad.UInt32, numbers)
         self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
-        self._number_tiles(self.first + (end - start + (bucket - 1)) // bucket)
+        begin, length = (walks.start - walks.list_start) // bucket, walks.end - walks.list_start
+        self._number_tiles(self.first + begin, self.first + (length + (bucket - 1)) // bucket)
 
-    def _number_tiles(self, end: UInt32) -> None:
-        """Of all buckets, those of a thread's tile up to number `end`."""
+    def _number_tiles(self, begin: UInt32, end: UInt32) -> None:
+        """Of the buckets of a thread's walk, those from number `begin` up to `end`."""
 
         def has_more(number: UInt32) -> Bool:
             return number < end
@@ -163,7 +176,7 @@ class _Checkpoints:
             dr.scatter(self.tile, self.tile_number, number)
             return (number + self.shape.threads,)
 
-        dr.while_loop((self.first + self.within,), has_more, write, mode="symbolic", label="buckets")
+        dr.while_loop((begin + self.within,), has_more, write, mode="symbolic", label="buckets")
 
     def keep(self, k: UInt32, transmittance: list[Float], sums: list[list[Float]]) -> None:
         """Before pair k, where a bucket starts there; of the pixels whose thread still walks."""

@@ -118,6 +118,12 @@ def thread_pixels(lists: TileLists) -> ThreadPixels:
     tile, within = thread // shape.threads, thread % shape.threads
     if lists.order is not None:
         tile = dr.gather(ad.UInt32, lists.order, tile)
+    return pixels_of_threads(lists, tile, within)
+
+
+def pixels_of_threads(lists: TileLists, tile: UInt32, within: UInt32) -> ThreadPixels:
+    """Of threads by their tiles and their numbers within these."""
+    shape = lists.shape
     across = shape.width // shape.columns
     column = (tile % lists.tiles_x) * shape.width + (within % across) * shape.columns
     row = (tile // lists.tiles_x) * shape.height + (within // across) * shape.rows
