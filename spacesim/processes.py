@@ -11,13 +11,15 @@ import queue
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
-from collections.abc import Callable, Iterable
+import traceback
+import weakref
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -33,23 +35,25 @@ _ROOT = str(Path(__file__).parents[1])
 class ChildProcess:
     """A process that runs `main` of a module.
 
-    module: its name; environment: variables that the process has besides
+    module: its name; lends: messages are lent to it (Linux alone); environment: variables that it has besides
     """
 
-    def __init__(self, module: str, **environment: str) -> None:
-        self._memory = _SharedMemory()
-        ours, theirs = socket.socketpair()
-        code = f"import sys; from {module} import main; main(int(sys.argv[1]))"
+    def __init__(self, module: str, lends: bool = False, environment: Mapping[str, str] = MappingProxyType({})) -> None:
+        self._memory = _SharedMemory() if lends else None
+        self._socket, theirs = socket.socketpair()
+        files = [theirs.fileno(), *([self._memory.file] if self._memory else [])]
+        # without the folder in which the user is, where a file may have the name of a module
+        code = f"import sys; sys.path.remove(''); from {module} import main; main(int(sys.argv[1]))"
         paths = [_ROOT, *filter(None, [os.environ.get("PYTHONPATH")])]
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", code, str(theirs.fileno())],
-                pass_fds=[theirs.fileno(), self._memory.file],
+                pass_fds=files,
                 stdin=subprocess.DEVNULL,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), **environment},
                 start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends it
             )
-        self._socket, self.connection = ours, Connection(os.dup(ours.fileno()))
+        self.connection = Connection(os.dup(self._socket.fileno()))
 
     def send(self, message: object) -> None:
         """Raises OSError where it has gone."""
@@ -57,7 +61,8 @@ class ChildProcess:
 
     def lend(self, message: object) -> None:
         """Send a message whose arrays lie in memory that both share, until the next one is lent: a socket takes 30
-        times as long for them. Raises OSError where it has gone."""
+        times as long for them. Raises OSError where it has gone, WorkError where memory is short."""
+        assert self._memory is not None, "started without memory to lend"
         buffers: list[pickle.PickleBuffer] = []
         content = pickle.dumps(message, 5, buffer_callback=buffers.append)
         self.connection.send(_Loan(content, self._memory.file, self._memory.store(buffers)))
@@ -72,7 +77,8 @@ class ChildProcess:
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         self.connection.close()
-        self._memory.close()
+        if self._memory is not None:
+            self._memory.close()
 
     def wait(self, patience: float = PATIENCE) -> None:
         """Until it has ended; after so many seconds it is killed."""
@@ -93,30 +99,24 @@ class _SharedMemory:
     """Memory that a process shares with one that it starts; it is gone with both."""
 
     def __init__(self) -> None:
-        if hasattr(os, "memfd_create"):
-            self.file = os.memfd_create(__name__)
-        else:
-            self.file, path = tempfile.mkstemp()
-            os.unlink(path)
+        self.file = os.memfd_create(__name__)
         self._bytes = np.empty(0, np.uint8)
+        self.close = weakref.finalize(self, os.close, self.file)
 
     def store(self, buffers: Iterable[pickle.PickleBuffer]) -> list[slice]:
         """Where each of the buffers lies now, instead of those before."""
         arrays = [np.frombuffer(buffer.raw(), np.uint8) for buffer in buffers]
         ends = np.cumsum([-(-array.size // ALIGNMENT) * ALIGNMENT for array in arrays], dtype=int).tolist()
         if ends and ends[-1] > self._bytes.size:
-            os.ftruncate(self.file, ends[-1])
-            self._bytes = np.frombuffer(mmap.mmap(self.file, ends[-1]), np.uint8)
+            try:
+                os.ftruncate(self.file, ends[-1])
+                self._bytes = np.frombuffer(mmap.mmap(self.file, ends[-1]), np.uint8)
+            except OSError as error:
+                raise WorkError(f"{ends[-1] / 1e6:.0f} MB of memory cannot be had ({error.strerror})") from None
         places = [slice(start, start + array.size) for start, array in zip([0, *ends], arrays, strict=False)]
         for place, array in zip(places, arrays, strict=True):
             self._bytes[place] = array
         return places
-
-    def close(self) -> None:
-        """Give this process's part of it back."""
-        if self.file >= 0:
-            os.close(self.file)
-        self.file, self._bytes = -1, np.empty(0, np.uint8)
 
 
 @dataclass(frozen=True)
@@ -148,13 +148,20 @@ def connect_to_parent(socket: int) -> tuple[queue.SimpleQueue[Any], Callable[[An
         while True:
             try:
                 message = connection.recv()
-                if isinstance(message, _Loan):
-                    if message.places and message.places[-1].stop > len(memory):
-                        memory = memoryview(mmap.mmap(message.file, 0))
-                    message = pickle.loads(message.content, buffers=[memory[place] for place in message.places])
-                inbox.put(message)
             except (EOFError, OSError):
                 os._exit(0)
+            if isinstance(message, _Loan):
+                if message.places and message.places[-1].stop > len(memory):
+                    memory = memoryview(mmap.mmap(message.file, 0))
+                message = pickle.loads(message.content, buffers=[memory[place] for place in message.places])
+            inbox.put(message)
+
+    def listen_or_end() -> None:
+        try:
+            listen()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
 
     def tell(message: object) -> None:
         try:
@@ -162,7 +169,7 @@ def connect_to_parent(socket: int) -> tuple[queue.SimpleQueue[Any], Callable[[An
         except OSError:
             os._exit(0)
 
-    threading.Thread(target=listen, daemon=True).start()
+    threading.Thread(target=listen_or_end, daemon=True).start()
     return inbox, tell
 
 

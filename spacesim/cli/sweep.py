@@ -23,7 +23,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
     parser.add_argument("--exposure", type=float, metavar="EV", help="of a run in linear light (that of its pictures)")
     parser.add_argument("--size", type=resolution, metavar="PX", help="pixels of the longer side, or WIDTHxHEIGHT")
-    kept = "write every picture into DIR/frames, too, of light.radiance as EXR beside PNG"
+    kept = "write every picture into DIR/frames, too, of light.linear as EXR beside PNG"
     parser.add_argument("--keep-frames", action="store_true", help=kept)
 
 

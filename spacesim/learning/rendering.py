@@ -45,8 +45,8 @@ class Rendering:
 
     @property
     def linear(self) -> np.ndarray | None:
-        """[H, W, 3] float32, linear display values over black, 1 white, not clipped, of a run that learned radiance
-        (`light.radiance`); None of others."""
+        """[H, W, 3] float32, linear display values over black, 1 white, not clipped, of a run in linear light
+        (`light.linear`); None of others."""
         return self._drawn.linear
 
     @property

@@ -149,7 +149,7 @@ class Client:
         scale = min(1.0, MAX_PICTURE_SIDE / max(view.width, view.height))
         width, height = (max(1, round(scale * side)) for side in (view.width, view.height))
         camera, give_way = view.camera(width, height), self._loop.give_way
-        state, mode, exposure = self._shared.state, settings.mode, settings.exposure
+        state, mode, exposure = self._shared.state, settings.mode, settings.stops
         _, picture, depths, _ = draw_mode(self._renderer, state, camera, mode, give_way, exposure)
         file = io.BytesIO()
         Image.fromarray(add_color_bar(picture, depths) if depths else picture).save(file, "PNG")

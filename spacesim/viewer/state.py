@@ -96,14 +96,19 @@ class DisplaySettings:
             object.__setattr__(self, name, value)
 
     @property
+    def stops(self) -> float:
+        """EV more than in training of this mode's pictures."""
+        return self.exposure if self.mode == "colour" else 0.0
+
+    @property
     def of_picture(self) -> tuple[str, int, float]:
         """What a picture without the truth depends on."""
-        return self.mode, self.side, self.exposure
+        return self.mode, self.side, self.stops
 
     @property
     def of_truth(self) -> tuple[str, int, float]:
         """What the truth depends on."""
-        return self.mode, self.samples, self.exposure
+        return self.mode, self.samples, self.stops
 
 
 def clamp(value: SupportsFloat | str, least: float, most: float, otherwise: float) -> float:

@@ -1,5 +1,6 @@
 """Small models to look at, without training."""
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,6 +19,9 @@ from spacesim.viewer.drawing.scene_renderer import SceneRenderer
 from spacesim.viewer.load import load_setup
 from spacesim.viewer.server import Viewer
 from spacesim.viewer.state import SceneState, ViewerCamera
+
+for folder in ("splat", "splat/compose"):
+    sys.path.insert(0, str(Path(__file__).parents[1] / folder))
 
 
 def ball_run(name: str, color: tuple[float, float, float], count: int = 400, radius: float = 0.5) -> Run:

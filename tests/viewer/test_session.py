@@ -160,11 +160,11 @@ def test_why_there_is_no_truth_is_said(made):
     source.found = "the scene is not known"
     session.change_settings(compare="difference")
     wait_for(lambda: screen.statistics[-1].status == "no truth: the scene is not known", "the reason")
-    session.change_settings(mode="depth")  # asks again
-    wait_for(lambda: source.asked == ["colour", "depth"], "the request")
+    session.change_settings(exposure=1.0)  # asks again
+    wait_for(lambda: source.asked == ["colour", "colour"], "the request")
+    session.change_settings(mode="depth")  # likewise
+    wait_for(lambda: source.asked == ["colour", "colour", "depth"], "the request")
     source.found = 7
-    session.change_settings(exposure=1.0)  # likewise
-    wait_for(lambda: len(source.asked) == 3, "the request")
     session.change_settings(mode="normals")
     wait_for(lambda: len(source.asked) == 4, "the request")
     session.on_trace_result(TraceResult(7, None, 0, True, "the process that traces ended"))

@@ -1,6 +1,7 @@
 """Encoding and writing of frames, in this process or in others beside it."""
 
 import queue
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -48,7 +49,7 @@ class EncoderProcesses:
 
     def __init__(self, encoder: FrameEncoder) -> None:
         self._encoder = encoder
-        self._idle: queue.SimpleQueue[ChildProcess] = queue.SimpleQueue()
+        self._idle: queue.LifoQueue[ChildProcess] = queue.LifoQueue()  # few processes do what few can
 
     def write(self, frame: TracedFrame) -> str:
         """Returns the frame's name. Raises what the process raises; WorkError where several end over the frame."""
@@ -60,11 +61,16 @@ class EncoderProcesses:
             except (EOFError, OSError):
                 ending = process.ending()
                 continue
+            except BaseException:
+                end([process])
+                raise
             self._idle.put(process)
             if isinstance(answer, BaseException):
                 raise answer
             return frame.name
-        raise WorkError(f"{frame.name}: {ATTEMPTS} processes ended while they wrote it, the last {ending}")
+        raise WorkError(
+            f"{frame.name}: {ATTEMPTS} processes ended while they wrote it, the last {ending}; is the memory short?"
+        )
 
     def close(self) -> None:
         """End them; no thread may be writing."""
@@ -74,12 +80,22 @@ class EncoderProcesses:
                 idle.append(self._idle.get_nowait())
         end(idle)
 
+    def start(self, count: int) -> None:
+        """So many of them, and wait until they can write."""
+        with ThreadPoolExecutor(count) as pool:
+            for process in list(pool.map(lambda _: self._started(), range(count))):
+                self._idle.put(process)
+
     def _take(self) -> ChildProcess:
         with suppress(queue.Empty):
             return self._idle.get_nowait()
-        process = ChildProcess(__name__)
-        with suppress(OSError):  # where it is dead already, the next message fails
+        return self._started()
+
+    def _started(self) -> ChildProcess:
+        process = ChildProcess(__name__, lends=True)
+        with suppress(EOFError, OSError):  # where it is dead already, the next message fails
             process.send(self._encoder)
+            process.receive()
         return process
 
 
@@ -87,6 +103,7 @@ def main(socket: int) -> None:
     """Write one frame after another, until the parent goes."""
     inbox, tell = connect_to_parent(socket)
     encoder: FrameEncoder = inbox.get()
+    tell(None)
     while True:
         frame: TracedFrame = inbox.get()
         try:

@@ -49,6 +49,7 @@ def samples(specs: Sequence[FrameSpec]) -> list[FrameSpec]:
 
 def measure(maker: FrameMaker, specs: Sequence[FrameSpec], left: Sequence[FrameSpec], root: Path) -> Estimate:
     """Make `specs` and estimate from them what those `left` in `root` take: time by samples, disk by frames."""
+    maker.start_encoders(len(specs))
     list(maker.make(specs[:1]))
     start = time.monotonic()
     list(maker.make(specs[1:]))

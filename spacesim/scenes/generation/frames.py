@@ -38,7 +38,7 @@ MAX_THREADS = 32
 PROCESSES_FROM = {"cuda": 1 << 16, "llvm": math.inf}
 """Pixels of frames from which processes encode, if there may be several: on a CPU rendering leaves them no core."""
 IN_FLIGHT = 1 << 30
-"""Bytes that frames which wait for a thread may hold: 57 frames of 512 x 512."""
+"""Bytes that frames which wait for a thread may hold: 48 frames of 512 x 512."""
 BYTES_A_PIXEL = 84
 """Of a frame's truth: 21 numbers, float32."""
 
@@ -169,16 +169,18 @@ class FrameMaker:
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(2 * job.threads, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
         self._at_once = min(AT_ONCE[select()], UNDER_WAY // pixels)
-        self._encode = self._encoding(pixels)
+        encoder = FrameEncoder(job.writer, job.camera, job.seed)
+        self._encode: Callable[[TracedFrame], str] = encoder.write
+        self._processes: EncoderProcesses | None = None
+        if job.threads > 1 and pixels >= PROCESSES_FROM[select()] and hasattr(os, "memfd_create"):
+            self._processes = EncoderProcesses(encoder)
+            self._encode = self._processes.write
+            weakref.finalize(self, self._processes.close)
 
-    def _encoding(self, pixels: int) -> Callable[[TracedFrame], str]:
-        """What writes a frame of so many pixels, on any thread."""
-        encoder = FrameEncoder(self._job.writer, self._job.camera, self._job.seed)
-        if self._job.threads == 1 or pixels < PROCESSES_FROM[select()]:
-            return encoder.write
-        processes = EncoderProcesses(encoder)
-        weakref.finalize(self, processes.close)
-        return processes.write
+    def start_encoders(self, frames: int) -> None:
+        """As many as so many frames need, where processes encode; else with the first frames."""
+        if self._processes is not None:
+            self._processes.start(min(self._job.threads, frames))
 
     def make(self, specs: Iterable[FrameSpec]) -> Iterator[str]:
         """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.

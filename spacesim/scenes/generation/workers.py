@@ -127,7 +127,7 @@ def _start(job: Job, task: _Task, number: int, count: int) -> _Worker:
     devices = cuda_devices() if backend.select() == "cuda" else []
     environment = {"CUDA_VISIBLE_DEVICES": devices[number % len(devices)]} if devices else {}
     start = (backend.select(), max(1, cores() // count), job)
-    return _Worker(ChildProcess(__name__, **environment), deque([task]), [start, task.specs])
+    return _Worker(ChildProcess(__name__, environment=environment), deque([task]), [start, task.specs])
 
 
 def _requeue(worker: _Worker, tasks: deque[_Task]) -> None:

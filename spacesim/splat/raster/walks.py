@@ -20,6 +20,7 @@ PART = 512  #: pairs, a power of two, some buckets of the adjoint
 #: splats a tile from which on lists are walked in parts: on an H100 a picture of 64 x 64 pixels of a million splats is
 #: blended in 0.5 ms, not 7, one of 256 x 256 in 0.7, not 1.2
 IN_PARTS = {"cuda": 2**9, "llvm": 2**32}
+MAX_TILES = 2**11  #: more keep the device busy
 
 
 @dataclass
@@ -59,7 +60,8 @@ def _unwalked(
 
 def are_in_parts(lists: TileLists, capacity: int) -> bool:
     """Whether lists are cut, by what does not depend on earlier pictures. capacity: length of the splats' arrays"""
-    return lists.capacity > 0 and capacity >= IN_PARTS[select()] * lists.tiles_x * lists.tiles_y
+    tiles = lists.tiles_x * lists.tiles_y
+    return lists.capacity > 0 and tiles <= MAX_TILES and capacity >= IN_PARTS[select()] * tiles
 
 
 def in_parts(lists: TileLists, channels: int, walk: Walk) -> Walks:
@@ -78,6 +80,7 @@ def in_parts(lists: TileLists, channels: int, walk: Walk) -> Walks:
     walks = _unwalked(lists, channels, pixels_of_threads(lists, tile, within), list_start, start, end)
     transmittance, sums = walk(walks)
     passed = [[values, *added] for values, added in zip(transmittance, sums, strict=True)]
+    dr.eval(passed)  # of all pixels at once, or each walks anew
     walks.last = dr.select(start > list_start, start, 0)
     is_last: Bool = end == list_end
     for p in range(pixels):
@@ -90,14 +93,19 @@ def in_parts(lists: TileLists, channels: int, walk: Walk) -> Walks:
     return walks
 
 
+def _parts_of(lists: TileLists, tile: UInt32) -> tuple[UInt32, UInt32]:
+    """(number of a tile's first part, number of the next tile's first or less)."""
+    start, end = (dr.gather(ad.UInt32, bounds, tile) for bounds in (lists.start, lists.end))
+    first = start // PART + tile
+    return first, first + (end - start + (PART - 1)) // PART
+
+
 def _number_parts(lists: TileLists, numbers: int) -> UInt32:
     """The tile of each part, the number of tiles where there is none."""
     tiles = lists.tiles_x * lists.tiles_y
     target = dr.full(ad.UInt32, tiles, numbers)
     tile = dr.arange(ad.UInt32, tiles)
-    start, end = (dr.gather(ad.UInt32, bounds, tile) for bounds in (lists.start, lists.end))
-    first = start // PART + tile
-    until = first + (end - start + (PART - 1)) // PART
+    first, until = _parts_of(lists, tile)
 
     def has_more(number: UInt32) -> Bool:
         return number < until
@@ -115,13 +123,10 @@ def _states_before(lists: TileLists, passed: list[Float], numbers: int) -> list[
     """[numbers * threads] each: transmittance, negative where the pixel is finished, and sums of a pixel of each thread
     before each part. passed: what the parts let pass and add, likewise."""
     tiles, threads = lists.tiles_x * lists.tiles_y, lists.shape.threads
-    dr.eval(passed)
     states = [dr.empty(ad.Float, numbers * threads) for _ in passed]
     index = dr.arange(ad.UInt32, tiles * threads)
     tile, within = index // threads, index % threads
-    start, end = (dr.gather(ad.UInt32, bounds, tile) for bounds in (lists.start, lists.end))
-    first = start // PART + tile
-    until = first + (end - start + (PART - 1)) // PART
+    first, until = _parts_of(lists, tile)
 
     def has_more(number: UInt32, _state: object) -> Bool:
         return number < until

@@ -58,7 +58,7 @@ def draw_frame(
     start = time.perf_counter()
     camera = view.camera(*picture_size(view, settings.side, share))
     try:
-        planes, picture, depths, note = draw_mode(renderer, state, camera, settings.mode, on_chunk, settings.exposure)
+        planes, picture, depths, note = draw_mode(renderer, state, camera, settings.mode, on_chunk, settings.stops)
     except InputError as error:
         planes = Planes(np.zeros((camera.height, camera.width)))
         picture, depths, note = _black(camera), None, f"no picture: {error}"

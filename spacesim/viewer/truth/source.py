@@ -21,7 +21,7 @@ from spacesim.viewer.truth.scene import (
     pose_objects,
     split_scene,
 )
-from spacesim.viewer.truth.tracer import OF_COLOUR, TraceRequest, TraceResult
+from spacesim.viewer.truth.tracer import TraceRequest, TraceResult
 from spacesim.viewer.truth.truth import SIDE, TraceQueue, ViewerTruth, matching_frame, stored_truth
 
 
@@ -45,8 +45,7 @@ class TruthService:
     ) -> ViewerTruth | int | str:
         """See `TruthSource`."""
         models = self._models(state)
-        as_recorded = settings.exposure == 0 or settings.mode not in OF_COLOUR
-        if self._dataset is not None and models is not None and as_recorded:
+        if self._dataset is not None and models is not None and settings.stops == 0:
             number = matching_frame(self._dataset, view, state)
             stored = None if number is None else stored_truth(self._dataset, number, settings.mode, models)
             if stored is not None:
@@ -62,7 +61,7 @@ class TruthService:
             return str(error)
         camera = view.camera(*picture_size(view, min(SIDE, settings.side)))
         models = model_of_objects(scenes)
-        request = TraceRequest(0, scene, camera, state.sun, settings.samples, settings.mode, models, settings.exposure)
+        request = TraceRequest(0, scene, camera, state.sun, settings.samples, settings.mode, models, settings.stops)
         return self._queue.ask(session, request)
 
     def cancel_truth(self, session: Session) -> None:

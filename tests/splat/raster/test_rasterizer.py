@@ -1,6 +1,5 @@
 """The Dr.Jit rasterizer against its float64 reference: pictures, gradients, symmetries, hostile input."""
 
-from dataclasses import replace
 from functools import cache
 
 import drjit as dr
@@ -31,11 +30,15 @@ SIZE = (40, 28)
 
 @pytest.fixture(autouse=True, params=["cuda", "llvm", "parts"])
 def way(request, monkeypatch):
-    """Each backend's tiles, order and adjoint, on the backend that runs; lists that are walked in parts, CUDA's. These
-    have tiles of their own, or recordings of whole lists would be replayed."""
+    """Each backend's tiles, order and adjoint, on the backend that runs; lists that are walked in parts, CUDA's, which
+    are traced, or recordings of whole lists would be replayed."""
     if request.param == "parts":
         take_cudas(monkeypatch)
-        monkeypatch.setattr(binning, "tile_shape", lambda *size: replace(tiles.tile_shape(*size), threads=16))
+        blending = rasterize.blend_lists.traced
+        for module in (rasterize, rendering):
+            monkeypatch.setattr(module, "blend_lists", blending)
+        for name in ("_draw_at_once", "_draw_boxes"):
+            monkeypatch.setattr(rendering, name, getattr(rendering, name).traced)
         monkeypatch.setattr(walks, "IN_PARTS", {"cuda": 0})
         monkeypatch.setattr(walks, "PART", 8)
     elif request.param != select():
@@ -408,8 +411,8 @@ def test_pictures_of_many_pixels_have_larger_tiles_on_cuda(monkeypatch):
 @pytest.mark.parametrize("size", [(1, 1), (8, 8), (9, 1), (1, 17)])
 def test_both_adjoints_agree_on_few_pixels(size, monkeypatch):
     for count in (300, 290):  # recorded, then replayed
-        by_buckets, by_tiles = adjoints(random_splats(count, seed=3), camera(*size), 3, True, monkeypatch)
-        monkeypatch.undo()
+        with monkeypatch.context() as patch:
+            by_buckets, by_tiles = adjoints(random_splats(count, seed=3), camera(*size), 3, True, patch)
         assert np.abs(by_tiles).max() > 0
         for ours, twin in zip(by_buckets, by_tiles, strict=True):
             np.testing.assert_allclose(ours, twin, atol=1e-5 * np.abs(twin).max())
@@ -418,8 +421,8 @@ def test_both_adjoints_agree_on_few_pixels(size, monkeypatch):
 def test_absolute_sums_change_no_gradient(monkeypatch):
     """And are as large as the sums with their signs, at least."""
     arrays, view = random_splats(120, seed=5), camera()
-    with_them = adjoints(arrays, view, 3, True, monkeypatch)
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        with_them = adjoints(arrays, view, 3, True, patch)
     for ours, without in zip(with_them, adjoints(arrays, view, 3, False, monkeypatch), strict=True):
         scale = np.abs(without).max(axis=1, keepdims=True)
         np.testing.assert_allclose(ours[:-2] / scale, without / scale, atol=1e-6)
@@ -437,7 +440,7 @@ def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
 
     for module in (rasterize, rendering):
         monkeypatch.setattr(module, "blend_lists", spied)
-    monkeypatch.setattr(rendering, "_draw_boxes", rendering._draw_boxes.traced)
+    monkeypatch.setattr(rendering, "_draw_boxes", getattr(rendering._draw_boxes, "traced", rendering._draw_boxes))
     monkeypatch.setattr(rendering, "expected_capacity", lambda _: None)
     arrays, view = random_splats(30), camera()
     picture(arrays, view)
