@@ -26,7 +26,7 @@ from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.eval.report.write import write_report
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
-from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig
+from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 
@@ -116,8 +116,7 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, offset receivers alone", with_shadow(mapped, grazing="lift")
     yield "splat, surface, offset receivers alone", with_shadow(splatted, grazing="lift")
     yield "map, surface, no refinement", with_shadow(mapped, refine=None)
-    closer = MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG)
-    yield "map, surface, percentage-closer", with_shadow(mapped, method=closer)
+    yield "map, surface, percentage-closer", with_shadow(mapped, method=MappingConfig("percentage-closer"))
     other = "median" if size == "fine" else "variance"
     yield f"map, surface, {other}", with_settings(mapped, {"light.shadow.method": {"filter": other}})
     yield "none, surface, unfiltered", replace(relit, antialiased=False)

@@ -68,9 +68,9 @@ def test_the_module_is_a_program_too():
         ("--method shadow-map --set light.shadow.grazing=none", "light shadow grazing", "none"),
         ("--method shadow-map --set light.shadow.size=24", "light shadow size", 24),
         (
-            "--method shadow-map --set light.shadow.method={filter='percentage-closer',sun_radius_deg=0.2666}",
-            "light shadow method sun_radius_deg",
-            0.2666,
+            "--method shadow-map --set light.shadow.method={filter='percentage-closer',radius=2.5}",
+            "light shadow method radius",
+            2.5,
         ),
         ("--method shadow-map --set light.shadow.refine=none", "light shadow refine", None),
         ("--method shadow-splat --set light.shadow.method.gradients=true", "light shadow method gradients", True),
@@ -607,8 +607,8 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ),
         ("--method shadow-map --set light.shadow.size=100000", ["--set light.shadow.size", "found 100000"]),
         (
-            "--method shadow-map --set light.shadow.method.sun_radius_deg=1",
-            ["method.sun_radius_deg", "percentage-closer"],
+            "--method shadow-map --set light.shadow.method.radius=0",
+            ["method.radius: expected 0.5 to 16 pixels, found 0"],
         ),
         (
             "--method shadow-map --set light.shadow.grazing=never",

@@ -220,7 +220,7 @@ _SETTINGS = (
     *("views_per_step", "surfels", "antialiased", "supersample", "init_box", "depth_weight", "normal_weight"),
     *("prior", "random_background", "light.field.inputs", "light.bounce", "light.linear", "light.tone"),
     *("light.exposure", "light.shadow.bias", "light.shadow.grazing", "light.shadow.method"),
-    *("light.shadow.method.filter", "light.shadow.method.sun_radius_deg", "light.shadow.size"),
+    *("light.shadow.method.filter", "light.shadow.method.radius", "light.shadow.size"),
     *(
         "init_count",
         "light.shadow.method.gradients",

@@ -126,15 +126,8 @@ def _closer(
     camera: OrthographicCamera,
 ) -> float:
     blocked = picture.alpha * _shadowed(picture.depth - receiver, softness)
-    half_x = half_y = config.radius
-    if config.sun_radius_deg > 0:
-        widest = max(config.widest, config.radius)
-        share = _shares(*at, widest, widest, camera) * blocked
-        gap = (share * (receiver - picture.depth)).sum() / share.sum() if share.sum() > 1e-6 else 0.0
-        across = max(gap, 0) * np.tan(np.radians(config.sun_radius_deg))
-        half_x = np.clip(across * camera.scale_x, config.radius, widest)
-        half_y = np.clip(across * camera.scale_y, config.radius, widest)
-    return float((_shares(*at, half_x, half_y, camera) * blocked).sum() / (4 * half_x * half_y))
+    share = _shares(*at, config.radius, config.radius, camera)
+    return float((share * blocked).sum() / (4 * config.radius**2))
 
 
 def _variance(picture: ReferenceOutput, share: Array, receiver: float, softness: float, config: MappingConfig) -> float:

@@ -37,5 +37,7 @@ def _light(light: JsonDict) -> JsonDict:
         light["shadow"] = shadow = {**shadow, "method": {"kind": method, **settings}}
     if isinstance(shadow, Mapping) and isinstance(method := shadow.get("method"), Mapping):
         ends = {"beta_min": 0.05} if method.get("kind") == "splatting" else {}
+        if method.get("sun_radius_deg") == 0:  # of windows as wide as a penumbra, which are gone
+            method = {name: value for name, value in method.items() if name not in ("sun_radius_deg", "widest")}
         light["shadow"] = {**shadow, "method": {**ends, **method}}
     return light

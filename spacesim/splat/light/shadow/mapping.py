@@ -24,7 +24,6 @@ from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.surface import NONE, surface_depth, walk
 
-SUN_RADIUS_DEG = 0.2666  #: angular radius of the Sun's disc at 1 au
 Filter = Literal["bilinear", "percentage-closer", "variance", "median"]
 FILTERS: tuple[Filter, ...] = get_args(Filter)
 MAX_WINDOW = 16  #: pixels to either side that a filter may read
@@ -46,10 +45,6 @@ class MappingConfig:
     #: one depth of the light's picture, or several tests or moments of a window of it
     filter: Filter = "bilinear"
     radius: float = 1.0  #: pixels, half the window's width, at least 1/2
-    #: with percentage-closer: widens the window to the penumbra that a disc of this angular radius, degrees, throws
-    #: across the mean gap to the blockers (Fernando 2005); the Sun's is 0.2666 at 1 au; 0 does not
-    sun_radius_deg: float = 0.0
-    widest: float = 8.0  #: pixels, half the width of the widest such window, and of the search for blockers
     bleeding: float = 0.2  #: with variance: lit shares below it count as none (Lauritzen 2007)
     #: what is thinner than a light pixel fades in the picture, where it would else grow to a pixel: shadows end where
     #: bodies do, within two pixels; the thesis does not say
@@ -57,13 +52,8 @@ class MappingConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("radius", "widest"):
-            if not 0.5 <= getattr(self, name) <= MAX_WINDOW:
-                raise InputError(f"{name}: expected 0.5 to {MAX_WINDOW} pixels, found {getattr(self, name)}")
-        if not 0 <= self.sun_radius_deg < 45:
-            raise InputError(f"sun_radius_deg: expected 0 to 45 degrees, found {self.sun_radius_deg}")
-        if self.sun_radius_deg and self.filter != "percentage-closer":
-            raise InputError(f"sun_radius_deg: expected the filter percentage-closer beside it, found {self.filter}")
+        if not 0.5 <= self.radius <= MAX_WINDOW:
+            raise InputError(f"radius: expected 0.5 to {MAX_WINDOW} pixels, found {self.radius}")
         if not 0 <= self.bleeding < 1:
             raise InputError(f"bleeding: expected a share from 0 to below 1, found {self.bleeding}")
 
@@ -223,7 +213,7 @@ def _occlusion_at(
     elif config.filter == "variance":
         occlusion = _by_variance(window, depth, softness, config)
     else:
-        occlusion = _percentage_closer(window, depth, softness, camera, config)
+        occlusion = _percentage_closer(window, depth, softness, config.radius)
     return dr.select(seen, occlusion, 0)
 
 
@@ -263,33 +253,20 @@ def _interpolate(window: "_Window", depth: Float, softness: Float) -> Float:
         is_covered = dr.select(alpha > 0, ad.Float(1), 0)
         return [is_covered, is_covered * _mean_depth(window.light, alpha, pixel, active)]
 
-    share, sums = window.sums(0.5, 0.5, 0.5, terms)
+    share, sums = window.sums(0.5, terms)
     is_covered = share > 0
     return dr.select(is_covered, _shadow_amount(sums * dr.rcp(dr.select(is_covered, share, 1)) - depth, softness), 0)
 
 
-def _percentage_closer(
-    window: "_Window", depth: Float, softness: Float, camera: Orthographic, config: MappingConfig
-) -> Float:
+def _percentage_closer(window: "_Window", depth: Float, softness: Float, radius: float) -> Float:
     """Every pixel's own test, averaged over the window; what is uncovered lets light pass."""
 
     def terms(alpha: Float, pixel: UInt32, active: Bool | bool) -> list[Float]:
         gap = _mean_depth(window.light, alpha, pixel, active) - depth
-        blocked = alpha * _shadow_amount(gap, softness)
-        return [blocked, -blocked * gap]
+        return [alpha * _shadow_amount(gap, softness)]
 
-    half_x = half_y = ad.Float(config.radius)
-    widest = config.radius
-    if config.sun_radius_deg > 0:
-        widest = max(config.radius, config.widest)
-        blocked, gaps = window.sums(widest, widest, widest, terms)
-        some = blocked > 1e-6
-        mean = dr.select(some, gaps * dr.rcp(dr.select(some, blocked, 1)), 0)
-        gap = dr.maximum(mean, 0)
-        penumbra = gap * math.tan(math.radians(config.sun_radius_deg))  # metres, half its width
-        half_x, half_y = (dr.clip(penumbra * camera[i], config.radius, widest) for i in (12, 13))
-    blocked, _ = window.sums(half_x, half_y, widest, terms)
-    return dr.clip(blocked * dr.rcp(4 * half_x * half_y), 0, 1)
+    (blocked,) = window.sums(radius, terms)
+    return dr.clip(blocked / (4 * radius * radius), 0, 1)
 
 
 def _by_variance(window: "_Window", depth: Float, softness: Float, config: MappingConfig) -> Float:
@@ -299,7 +276,7 @@ def _by_variance(window: "_Window", depth: Float, softness: Float, config: Mappi
     def terms(alpha: Float, pixel: UInt32, active: Bool | bool) -> list[Float]:
         return [alpha, *(dr.gather(ad.Float, plane, pixel, active) for plane in (light.depth, light.square))]
 
-    alpha, first, second = window.sums(config.radius, config.radius, config.radius, terms)
+    alpha, first, second = window.sums(config.radius, terms)
     is_covered = alpha > 0
     inverse = dr.rcp(dr.select(is_covered, alpha, 1))
     mean = first * inverse
@@ -332,17 +309,15 @@ class _Window:
     light: ShadowMap
     active: Bool | bool
 
-    def sums(
-        self, half_x: Float | float, half_y: Float | float, widest: float, terms: Callable[..., list[Float]]
-    ) -> list[Float]:
-        """Sums of share x term over the pixels that the box (x +- half_x, y +- half_y) touches; the share is how much
-        of a pixel the box covers, so the sums are continuous in x and y. half_x, half_y: pixels, at most `widest`.
+    def sums(self, half: float, terms: Callable[..., list[Float]]) -> list[Float]:
+        """Sums of share x term over the pixels that the box (x +- half, y +- half) touches; the share is how much of a
+        pixel the box covers, so the sums are continuous in x and y. half: pixels
 
         terms: (alpha, flat index of a pixel, Bool: is it in the image and the box) to Floats [N]; only there they
         count.
         """
-        side = math.ceil(2 * widest) + 1  # pixels that such a box can touch
-        left, top = dr.floor(self.x - half_x), dr.floor(self.y - half_y)
+        side = math.ceil(2 * half) + 1  # pixels that such a box can touch
+        left, top = dr.floor(self.x - half), dr.floor(self.y - half)
         light = self.light
 
         def has_more(k: UInt32, _sums: object) -> Bool:
@@ -350,7 +325,7 @@ class _Window:
 
         def add(k: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
             column, row = left + ad.Float(k % side), top + ad.Float(k // side)
-            share = _overlap(column, self.x, half_x) * _overlap(row, self.y, half_y)
+            share = _overlap(column, self.x, half) * _overlap(row, self.y, half)
             active = self.active & (share > 0)
             active &= (column >= 0) & (column < light.width) & (row >= 0) & (row < light.height)
             pixel = ad.UInt32(dr.select(active, row, 0)) * light.width + ad.UInt32(dr.select(active, column, 0))

@@ -13,7 +13,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at, quaternion_from_rotation
 from spacesim.splat.light.shadow import mapping
 from spacesim.splat.light.shadow.light_camera import fit_camera, light_rows
-from spacesim.splat.light.shadow.mapping import SUN_RADIUS_DEG, MappingConfig, occlusion_by_mapping
+from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.reference.shadow_mapping import camera_record, reference_bias, reference_occlusion
@@ -21,7 +21,6 @@ from spacesim.splat.reference.shadow_mapping import camera_record, reference_bia
 CONFIGS = {
     "bilinear": MappingConfig(),
     "closer": MappingConfig("percentage-closer", radius=1.3),
-    "penumbra": MappingConfig("percentage-closer", sun_radius_deg=4.0, widest=5.0),
     "variance": MappingConfig("variance", radius=1.0),
     "median": MappingConfig("median"),
     "dilated": MappingConfig(antialiased=False),
@@ -104,26 +103,12 @@ def test_half_of_the_window_half_dark():
     assert ramp == pytest.approx(0.8 * 12 / 64, abs=2 / 64)  # a box of 12 pixels climbs by 0.8 over 0.8 of its width
 
 
-def test_penumbra_grows_with_the_gap():
-    """A disc of 3 degrees' radius behind an edge h metres above: the penumbra is 2 h tan 3 deg wide."""
-    widths = []
-    for h in (0.5, 1.0):
-        row = splats([[x, y, h] for x in np.arange(0.01, 0.9, 0.01) for y in np.arange(-0.5, 0.5, 0.01)], 0.005, 0.999)
-        places = np.linspace(-0.2, 0.2, 81)
-        arrays = joined(row, splats([[x, 0, 0] for x in places], 0.001, 0.01))
-        config = MappingConfig("percentage-closer", radius=0.5, sun_radius_deg=3.0, widest=16, antialiased=False)
-        found = occlusion(arrays, from_above(256, 2.0), [0.02] * len(arrays["means"]), config=config)[-81:]
-        widths.append((np.interp(0.9, found, places) - np.interp(0.1, found, places)) / 0.8)
-    assert widths == pytest.approx([2 * h * np.tan(np.radians(3.0)) for h in (0.5, 1.0)], abs=2 * 2 / 256)
-    assert MappingConfig("percentage-closer", sun_radius_deg=SUN_RADIUS_DEG).sun_radius_deg == 0.2666
-
-
 def test_two_half_transparent_blockers():
     """The depth test knows one depth: behind both it is dark. Filters weight it with what they cover, 1 - (1 - a)^2.
     The receiver is as wide so faint that its own share of a pixel does not count."""
     blockers = splats([[0, 0, 0.6], [0, 0, 0.3]], [5, 5, 0.001], 0.5)
     arrays = joined(blockers, splats([[0, 0, 0]], 0.001, 0.004))
-    expected = {"bilinear": 1, "closer": 0.75, "penumbra": 0.75}
+    expected = {"bilinear": 1, "closer": 0.75}
     for name, value in expected.items():
         found = occlusion(arrays, from_above(), [0.01] * 3, config=CONFIGS[name])
         assert found[2] == pytest.approx(value, abs=0.003), name
@@ -347,8 +332,7 @@ def test_a_face_along_the_light_stays_finite():
     [
         ({"filter": "soft"}, "filter: expected one of bilinear, percentage-closer, variance, median, found 'soft'"),
         ({"radius": 0.2}, "radius: expected 0.5 to 16 pixels, found 0.2"),
-        ({"widest": 99}, "widest: expected 0.5 to 16 pixels, found 99"),
-        ({"sun_radius_deg": -1}, "sun_radius_deg: expected 0 to 45 degrees, found -1"),
+        ({"radius": 99}, "radius: expected 0.5 to 16 pixels, found 99"),
         ({"bleeding": 1.0}, "bleeding: expected a share from 0 to below 1, found 1.0"),
     ],
 )
