@@ -28,9 +28,9 @@ class Walks:
     """Of each thread: its pixels, what it walks, and from what state. Lists are of the thread's pixels."""
 
     thread: ThreadPixels
-    list_start: UInt32  #: of its tile
-    start: UInt32
-    end: UInt32
+    list_start: UInt32  #: first pair of its tile
+    start: UInt32  #: first pair of the walk
+    end: UInt32  #: one past its last
     transmittance: list[Float]  #: before the walk; negative of pixels that are finished
     sums: list[list[Float]]  #: C of each pixel, before the walk
     last: UInt32  #: one past the last pair blended before the walk, or more
