@@ -28,6 +28,7 @@ from spacesim.backend import BackendError
 from spacesim.data.errors import InputError, WorkError
 
 ALIGNMENT = 64  #: bytes, of arrays in shared memory
+ATTEMPTS = 3  #: processes that may end over the same work
 PATIENCE = 5.0  #: seconds in which processes end after they are asked to
 _ROOT = str(Path(__file__).parents[1])
 

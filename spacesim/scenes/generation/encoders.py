@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from spacesim.data.errors import WorkError
 from spacesim.data.records import Truth
 from spacesim.data.store import FrameWriter
-from spacesim.processes import ChildProcess, as_raisable, connect_to_parent, end
+from spacesim.processes import ATTEMPTS, ChildProcess, as_raisable, connect_to_parent, end
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
-
-ATTEMPTS = 3  #: processes that may end over a frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,9 @@ from typing import Any
 from spacesim import backend
 from spacesim.data.errors import WorkError
 from spacesim.data.files import remove_leftovers
-from spacesim.processes import ChildProcess, as_raisable, connect_to_parent, end
+from spacesim.processes import ATTEMPTS, ChildProcess, as_raisable, connect_to_parent, end
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
 
-ATTEMPTS = 3  #: times that a task is given out before its death counts as its own fault
 MAX_FRAMES = 16  #: of a task: what a process that dies has to do again
 
 

@@ -6,7 +6,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import drjit as dr
@@ -78,8 +78,12 @@ class DrawnView:
         """See `Prediction.linear`. stops: as of `image`"""
         if self.curve is None or "rgb" not in self.planes:
             return None
-        colors = planes_image(self.planes["rgb"], self.output.width, self.output.height)
-        return display_light(colors, self.curve, stops)
+        return display_light(self._rgb, self.curve, stops)
+
+    @cached_property
+    def _rgb(self) -> np.ndarray:
+        """[H, W, 3] as blended, read back once."""
+        return planes_image(self.planes["rgb"], self.output.width, self.output.height)
 
     def image(self, name: str, stops: float = 0.0) -> np.ndarray:
         """One of `OUTPUTS` that was asked for: rgb [H, W, 3] sRGB values over black, normal [H, W, 3], others [H, W];
@@ -91,8 +95,7 @@ class DrawnView:
             raise ValueError(f"name: expected one of the outputs asked for, found {name!r}")
         size, planes = (self.output.width, self.output.height), self.planes[name]
         if name == "rgb":
-            rgb = planes_image(planes, *size)
-            return adjust_exposure(rgb, self.curve.tone, stops, self.curve.white) if self.curve else rgb
+            return adjust_exposure(self._rgb, self.curve.tone, stops, self.curve.white) if self.curve else self._rgb
         if name == "visibility":
             return planes_image([over_alpha(planes[0], self.output.alpha)], *size)[..., 0]
         if not planes:

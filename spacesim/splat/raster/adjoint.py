@@ -17,6 +17,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.lists.pieces import count_pieces, read_pieces
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
@@ -24,7 +25,6 @@ from spacesim.splat.raster.records import (
     LOG2_E,
     POWER_MIN,
     BlendState,
-    bucket_numbers,
     exp2,
     exponents,
     load,
@@ -211,7 +211,7 @@ def by_buckets(
     assert lists.tile is not None, "slots of pairs in no list are not written"
     pixels, bucket = shape.width * shape.height, state.bucket
     looks = _pixel_packets(features, state.transmittance, lists, grad_planes)
-    tiles, bucket_count = lists.tiles_x * lists.tiles_y, bucket_numbers(lists, bucket)
+    tiles, bucket_count = lists.tiles_x * lists.tiles_y, count_pieces(lists, bucket)
     number = dr.arange(ad.UInt32, bucket_count)
     buckets = _buckets(state, lists, number)
     records = [_record(state, buckets, i, lists) for i in range(bucket)]
@@ -287,15 +287,12 @@ def _add_pixel(
 
 
 def _buckets(state: BlendState, lists: TileLists, number: UInt32) -> _Buckets:
-    tile, shape = dr.gather(ad.UInt32, state.bucket_tile, number), lists.shape
-    exists = tile < lists.tiles_x * lists.tiles_y
-    tile = dr.select(exists, tile, 0)
-    start = dr.gather(ad.UInt32, lists.start, tile)
-    first = start + (number - (start // state.bucket + tile)) * state.bucket
-    end = dr.select(exists, dr.gather(ad.UInt32, lists.end, tile), 0)
+    assert state.bucket_tile is not None, "blending has kept no buckets"
+    pieces, shape = read_pieces(lists, state.bucket, state.bucket_tile, number), lists.shape
+    tile, end = pieces.tile, dr.select(pieces.exists, pieces.list_end, 0)
     left, top = (tile % lists.tiles_x) * shape.width, (tile // lists.tiles_x) * shape.height
-    reached = exists & (dr.gather(ad.UInt32, state.bucket_reached, number) > 0)
-    return _Buckets(tile, reached, ad.Float(left), ad.Float(top), first, end)
+    reached = pieces.exists & (dr.gather(ad.UInt32, state.bucket_reached, number) > 0)
+    return _Buckets(tile, reached, ad.Float(left), ad.Float(top), pieces.first, end)
 
 
 def _record(state: BlendState, buckets: _Buckets, i: int, lists: TileLists) -> list[Float]:

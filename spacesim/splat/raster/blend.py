@@ -14,6 +14,7 @@ import drjit as dr
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, NumberT, UInt32
 from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
+from spacesim.splat.raster.lists.pieces import count_pieces, name_tiles
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
@@ -23,7 +24,6 @@ from spacesim.splat.raster.records import (
     BlendResult,
     BlendState,
     ListedRecords,
-    bucket_numbers,
     exp2,
     exponents,
     list_records,
@@ -50,7 +50,7 @@ def forward(
 def _bucket(lists: TileLists, channels: int) -> int:
     """Pairs of a bucket; 0 for the adjoint by tiles."""
     pixels = lists.shape.width * lists.shape.height
-    needed = 16 * -(-(1 + channels) // 4) * pixels * bucket_numbers(lists, BUCKET)
+    needed = 16 * -(-(1 + channels) // 4) * pixels * count_pieces(lists, BUCKET)
     return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
 
 
@@ -155,7 +155,7 @@ class _Checkpoints:
     """What the blending loop keeps of pixels before each bucket, see `BlendState`."""
 
     def __init__(self, lists: TileLists, bucket: int, channels: int, walks: Walks) -> None:
-        numbers, fours = bucket_numbers(lists, bucket), -(-(1 + channels) // 4)
+        numbers, fours = count_pieces(lists, bucket), -(-(1 + channels) // 4)
         pixels, thread = lists.shape.width * lists.shape.height, walks.thread.place
         self.shape, self.bucket, self.start = lists.shape, bucket, walks.list_start
         self.tile_number, self.within = thread // lists.shape.threads, thread % lists.shape.threads
@@ -164,19 +164,8 @@ class _Checkpoints:
         self.reached = dr.zeros(ad.UInt32, numbers)
         self.tile = dr.full(ad.UInt32, lists.tiles_x * lists.tiles_y, numbers)
         begin, length = (walks.start - walks.list_start) // bucket, walks.end - walks.list_start
-        self._number_tiles(self.first + begin, self.first + (length + (bucket - 1)) // bucket)
-
-    def _number_tiles(self, begin: UInt32, end: UInt32) -> None:
-        """Of the buckets of a thread's walk, those from number `begin` up to `end`."""
-
-        def has_more(number: UInt32) -> Bool:
-            return number < end
-
-        def write(number: UInt32) -> tuple[UInt32]:
-            dr.scatter(self.tile, self.tile_number, number)
-            return (number + self.shape.threads,)
-
-        dr.while_loop((begin + self.within,), has_more, write, mode="symbolic", label="buckets")
+        until = self.first + (length + (bucket - 1)) // bucket
+        name_tiles(self.tile, self.tile_number, self.first + begin + self.within, until, lists.shape.threads)
 
     def keep(self, k: UInt32, transmittance: list[Float], sums: list[list[Float]]) -> None:
         """Before pair k, where a bucket starts there; of the pixels whose thread still walks."""

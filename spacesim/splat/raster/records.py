@@ -41,7 +41,7 @@ class ListedRecords:
 @dataclass
 class BlendState:
     """What blending leaves behind for its way back. What is [T * pixels of a tile] is tile-major: a tile's pixels stand
-    thread by thread, a thread's as in `thread_offsets`."""
+    thread by thread, a thread's as in `thread_offsets`. B is `count_pieces` of buckets."""
 
     transmittance: Float  #: what passes through all splats, [T * pixels of a tile]
     last: UInt32  #: one past the last pair blended of each pixel, [T * pixels of a tile]
@@ -61,11 +61,6 @@ class BlendResult:
     features: list[Float]  #: C planes, sum of w_i f_i
     transmittance: Float  #: plane, what passes through all splats
     state: BlendState | None  #: for `backward`, where it was asked for
-
-
-def bucket_numbers(lists: TileLists, bucket: int) -> int:
-    """B, more than there are buckets: those of tile t are numbered from start[t] // bucket + t."""
-    return lists.capacity // bucket + lists.tiles_x * lists.tiles_y + 1
 
 
 def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[Float]:

@@ -13,6 +13,7 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.splat.raster.lists.pieces import count_pieces, name_tiles, read_pieces
 from spacesim.splat.raster.lists.tiles import ThreadPixels, TileLists, pixels_of_threads, thread_pixels
 from spacesim.splat.raster.records import TRANSMITTANCE_MIN
 
@@ -67,22 +68,21 @@ def are_in_parts(lists: TileLists, capacity: int) -> bool:
 def in_parts(lists: TileLists, channels: int, walk: Walk) -> Walks:
     """Threads for each part of each list, from the states that a first `walk` finds."""
     tiles, threads, pixels = lists.tiles_x * lists.tiles_y, lists.shape.threads, lists.shape.pixels
-    numbers = lists.capacity // PART + tiles + 1  # parts of tile t are numbered from start[t] // PART + t
-    tile_of_part = _number_parts(lists, numbers)
+    numbers = count_pieces(lists, PART)
+    tile_of_part, tile = dr.full(ad.UInt32, tiles, numbers), dr.arange(ad.UInt32, tiles)
+    name_tiles(tile_of_part, tile, *_parts_of(lists, tile))
+    dr.eval(tile_of_part)
     index = dr.arange(ad.UInt32, numbers * threads)
-    number, within = index // threads, index % threads
-    tile = dr.gather(ad.UInt32, tile_of_part, number)
-    exists = tile < tiles
-    tile = dr.select(exists, tile, 0)
-    list_start, list_end = (dr.gather(ad.UInt32, bounds, tile) for bounds in (lists.start, lists.end))
-    start = list_start + (number - (list_start // PART + tile)) * PART
-    end: UInt32 = dr.select(exists, dr.minimum(start + PART, list_end), start)
-    walks = _unwalked(lists, channels, pixels_of_threads(lists, tile, within), list_start, start, end)
+    parts = read_pieces(lists, PART, tile_of_part, index // threads)
+    start, exists = parts.first, parts.exists
+    end: UInt32 = dr.select(exists, dr.minimum(start + PART, parts.list_end), start)
+    thread = pixels_of_threads(lists, parts.tile, index % threads)
+    walks = _unwalked(lists, channels, thread, parts.list_start, start, end)
     transmittance, sums = walk(walks)
     passed = [[values, *added] for values, added in zip(transmittance, sums, strict=True)]
     dr.eval(passed)  # of all pixels at once, or each walks anew
-    walks.last = dr.select(start > list_start, start, 0)
-    is_last: Bool = end == list_end
+    walks.last = dr.select(start > parts.list_start, start, 0)
+    is_last: Bool = end == parts.list_end
     for p in range(pixels):
         before = _states_before(lists, passed[p], numbers)
         first, *walks.sums[p] = (dr.gather(ad.Float, array, index) for array in before)
@@ -98,25 +98,6 @@ def _parts_of(lists: TileLists, tile: UInt32) -> tuple[UInt32, UInt32]:
     start, end = (dr.gather(ad.UInt32, bounds, tile) for bounds in (lists.start, lists.end))
     first = start // PART + tile
     return first, first + (end - start + (PART - 1)) // PART
-
-
-def _number_parts(lists: TileLists, numbers: int) -> UInt32:
-    """The tile of each part, the number of tiles where there is none."""
-    tiles = lists.tiles_x * lists.tiles_y
-    target = dr.full(ad.UInt32, tiles, numbers)
-    tile = dr.arange(ad.UInt32, tiles)
-    first, until = _parts_of(lists, tile)
-
-    def has_more(number: UInt32) -> Bool:
-        return number < until
-
-    def write(number: UInt32) -> tuple[UInt32]:
-        dr.scatter(target, tile, number)
-        return (number + 1,)
-
-    dr.while_loop((first,), has_more, write, mode="symbolic", label="parts")
-    dr.eval(target)
-    return target
 
 
 def _states_before(lists: TileLists, passed: list[Float], numbers: int) -> list[Float]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from splats import random_splats, take_cudas
 
-from spacesim.backend import ad, select
+from spacesim.backend import Recorded, ad, select
 from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
@@ -34,11 +34,10 @@ def way(request, monkeypatch):
     are traced, or recordings of whole lists would be replayed."""
     if request.param == "parts":
         take_cudas(monkeypatch)
-        blending = rasterize.blend_lists.traced
         for module in (rasterize, rendering):
-            monkeypatch.setattr(module, "blend_lists", blending)
-        for name in ("_draw_at_once", "_draw_boxes"):
-            monkeypatch.setattr(rendering, name, getattr(rendering, name).traced)
+            for name, function in list(vars(module).items()):
+                if isinstance(function, Recorded):
+                    monkeypatch.setattr(module, name, function.traced)
         monkeypatch.setattr(walks, "IN_PARTS", {"cuda": 0})
         monkeypatch.setattr(walks, "PART", 8)
     elif request.param != select():

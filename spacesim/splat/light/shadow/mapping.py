@@ -340,6 +340,6 @@ class _Window:
         return list(sums)
 
 
-def _overlap(pixel: Float, centre: Float, half: Float | float) -> Float:
+def _overlap(pixel: Float, centre: Float, half: float) -> Float:
     """Length of [pixel, pixel + 1] within [centre - half, centre + half]."""
     return dr.maximum(dr.minimum(pixel + 1, centre + half) - dr.maximum(pixel, centre - half), 0)
