@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from support import common
 
 from spacesim import backend
@@ -28,6 +27,7 @@ COLUMNS = {
     "BER": ("shadow", "ber", "mean"),
     "mask error": ("shadow_mask", "error_rate", "mean"),
 }
+GAUSSIANS = {"Gaussians": ("model", "gaussians")}
 TEST_SUNS = 8
 
 
@@ -77,20 +77,9 @@ def rows_of(counts: list[int], options: Any) -> Iterator[common.Row]:
 
 
 def summary(results: list[common.Row]) -> common.Row:
-    """Means over trainings, and deviations where there are several; {"note": why} where one has failed."""
-    notes = [result["note"] for result in results if "note" in result]
-    if notes:
-        return {"note": notes[0]}
-    cells: common.Row = {}
-    for heading, (group, metric, what) in COLUMNS.items():
-        values = [common.number_in(result, group, metric, what) for result in results]
-        found = [value for value in values if value is not None]
-        if len(found) < len(results):
-            continue
-        cells[heading] = float(np.mean(found))
-        if len(found) > 1:
-            cells[f"{heading}, deviation"] = float(np.std(found, ddof=1))
-    return {**cells, "Gaussians": int(np.mean([result["model"]["gaussians"] for result in results]))}
+    """Means over trainings, and how many Gaussians there are."""
+    cells = common.means(results, COLUMNS)
+    return cells if "note" in cells else cells | {"Gaussians": int(common.means(results, GAUSSIANS)["Gaussians"])}
 
 
 if __name__ == "__main__":
