@@ -25,7 +25,7 @@ from spacesim.data.store import read_dataset
 from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.eval.report.write import write_report
 from spacesim.splat.light.config import LightConfig
-from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
+from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
@@ -127,11 +127,6 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, light of twice the size", with_shadow(mapped, size=2 * shadow_of(mapped).size)
     yield "map, surface, linear", replace(mapped, light=replace(light_of(mapped), linear=True))
     yield "map, surface, linear, filmic", replace(mapped, light=replace(light_of(mapped), linear=True, tone="filmic"))
-    moving = SplattingConfig(gradients=True)
-    yield "splat, surface, gradients", with_shadow(splatted, method=moving)
-    both = with_shadow(replace(splatted, visibility_weight=0.1), method=moving)
-    yield "splat, surface, supervised, gradients", both
-    yield "splat, surface, offset receivers alone, supervised, gradients", with_shadow(both, grazing="lift")
     yield "none, surface, bounce", with_bounce(relit, light_of(splatted).bounce)
     yield "map, surface, no bounce", with_bounce(mapped, 0)
     yield "splat, surface, no bounce", with_bounce(splatted, 0)

@@ -73,7 +73,7 @@ def test_the_module_is_a_program_too():
             2.5,
         ),
         ("--method shadow-map --set light.shadow.refine=none", "light shadow refine", None),
-        ("--method shadow-splat --set light.shadow.method.gradients=true", "light shadow method gradients", True),
+        ("--method shadow-splat --set light.shadow.method.beta_min=0.1", "light shadow method beta_min", 0.1),
         ("--method shadow-splat --set visibility_weight=0.3", "visibility_weight", 0.3),
         ("--method relight --set light.bounce=7", "light bounce", 7),
         ("--method vanilla --set supersample=3", "supersample", 3),
@@ -585,13 +585,13 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         (
             "--method shadow-splat --set light.shadow.method.filter=median",
             [
-                "light.shadow.method.filter: expected one of kind, gradients, beta_min, found 'filter'",
+                "light.shadow.method.filter: expected one of kind, beta_min, found 'filter'",
                 "; kind mapping knows it",
             ],
         ),
         (
-            "--method shadow-map --set light.shadow.method.gradients=true",
-            ["light.shadow.method.gradients", "kind splatting knows it"],
+            "--method shadow-map --set light.shadow.method.beta_min=0.1",
+            ["light.shadow.method.beta_min", "kind splatting knows it"],
         ),
         (
             "--method shadow-map --set light.shadow.method=splatting",

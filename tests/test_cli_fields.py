@@ -54,7 +54,7 @@ def test_every_field_has_a_meaning(method, strategy):
 
 def test_what_cannot_be_set_is_no_option():
     found = {field.key for field in fields_of(preset("fine", "baseline-park"))}
-    assert "light.shadow.method.gradients" in found
+    assert "light.shadow.method.beta_min" in found
     assert "light.shadow.method.baseline" not in found
     assert "baseline-park" in reference()
     assert "`baseline`" not in reference()

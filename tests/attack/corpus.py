@@ -223,7 +223,7 @@ _SETTINGS = (
     *("light.shadow.method.filter", "light.shadow.method.radius", "light.shadow.size"),
     *(
         "init_count",
-        "light.shadow.method.gradients",
+        "light.shadow.method.beta_min",
         "light.shadow.refine",
         "visibility_weight",
         "refinement.prune_opacity",

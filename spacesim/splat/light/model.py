@@ -2,7 +2,7 @@
 (4.3), and the adjoint of both.
 
 `LightModel.shade` is the forward pass, `LightModel.adjoint` the way back to features and weights. View directions count
-as given, and so do shadows, as in the literature, unless `ShadowConfig.gradients` takes them back to the Gaussians.
+as given, and so do shadows, as in the literature.
 """
 
 import logging
@@ -59,7 +59,6 @@ class Shading:
     colors: list[Float]  #: 3 arrays [N], display values that visibility has dimmed (4.17)
     #: Float [N] in [0, 1] as pictures show it, so times `sun_facing`, which colours do without, or None
     visibility: Float | None
-    shadows: Shadows | None  #: raw, or None
     inputs: ShadingInputs  #: what `LightModel.adjoint` wants
     batch: PaddedBatch  #: what `LightModel.adjoint` wants
     tape: ShadingTape  #: what `LightModel.adjoint` wants
@@ -100,9 +99,6 @@ class LightGradients:
     features: Float  #: Float [F * N]
     weights: list[Float]  #: as `LightModel.weights`
     embeddings: list[Float]  #: as `LightModel.embeddings`
-    #: of the first 11 rows of the Gaussians (`Gaussians.rows`), through their shadows, or nothing where shadows count
-    #: as given
-    geometry: list[Float]
     #: of the Sun's direction through the field, Float [3] in a list, shadows as given, or nothing where not asked for
     sun: list[Float]
 
@@ -175,7 +171,7 @@ class LightModel:
         inputs = self._inputs(gaussians, camera, terms, shadows, self.surroundings(gaussians))
         batch = PaddedBatch.of(gaussians.count)
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
-        return Shading(colors, visibility[0] if visibility else None, shadows, inputs, batch, tape, picture)
+        return Shading(colors, visibility[0] if visibility else None, inputs, batch, tape, picture)
 
     def surroundings(self, gaussians: Gaussians) -> Surroundings | None:
         """What these see around them, or saw at the last `hold_surroundings`; None for a model without a bounce."""
@@ -299,7 +295,7 @@ class LightModel:
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
         visibility [N]. by_sun: also the gradient of the Sun's direction"""
         grad_visibilities = [] if grad_visibility is None else [grad_visibility]
-        grad_features, grad_weights, grad_occlusion, by_encoding, grad_sun = kernels.adjoint(
+        grad_features, grad_weights, by_encoding, grad_sun = kernels.adjoint(
             self.config,
             self.weights,
             shading.inputs,
@@ -309,9 +305,8 @@ class LightModel:
             grad_visibilities,
             by_sun,
         )
-        grad_geometry = shading.shadows.adjoint(grad_occlusion[0]) if grad_occlusion and shading.shadows else []
         by_embeddings = [self._embedding_gradient(gradient, shading.picture) for gradient in by_encoding]
-        return LightGradients(grad_features, grad_weights, by_embeddings, grad_geometry, grad_sun)
+        return LightGradients(grad_features, grad_weights, by_embeddings, grad_sun)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """For a file: the weights, the embeddings [V, E] where pictures have some, and the training frame."""

@@ -44,7 +44,6 @@ from spacesim.splat.light.shadow.refine import (
     ShadowRefinementConfig,
     refine_inputs,
     refine_occlusion,
-    refine_occlusion_slope,
 )
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.light.surroundings import Surroundings
@@ -206,10 +205,9 @@ def adjoint(
     grad_color: list[Float],
     grad_visibility: list[Float],
     by_sun: bool,
-) -> tuple[Float, list[Float], list[Float], list[Float], list[Float]]:
-    """(gradient of the features, gradients of the weights, [gradient of the raw occlusion] where it is asked for,
-    [gradient of `SunEncoding.field_encoding`] where pictures have embeddings, [gradient of the Sun's direction, Float
-    [3]] where `by_sun` asks for it)."""
+) -> tuple[Float, list[Float], list[Float], list[Float]]:
+    """(gradient of the features, gradients of the weights, [gradient of `SunEncoding.field_encoding`] where pictures
+    have embeddings, [gradient of the Sun's direction, Float [3]] where `by_sun` asks for it)."""
     field_weights, refine_weights = split_weights(config, weights)
     visibility = 1 - tape.occlusion[0] if tape.occlusion else 1
     gradients = [batch.pad_zeros(gradient) for gradient in grad_color]
@@ -238,10 +236,10 @@ def adjoint(
     if config.field.surface:
         field_inputs = _field_inputs(inputs)
         parts.append((normals_adjoint(config.field, field_inputs, grad_items, grad_facing, grad_earth, batch), 0, 3))
-    grad_occlusion = -sum(
-        (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
-    )
     if config.refine:
+        grad_occlusion = -sum(
+            (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
+        )
         occlusion = tape.occlusion[0]
         grad_logit = grad_occlusion * occlusion * (1 - occlusion)
         grad_output = batch.matrix([grad_logit])
@@ -250,20 +248,10 @@ def adjoint(
         )
         grad_weights += grad_refine_weights
         parts.append((grad_items, 1, config.refine.features))  # the raw occlusion stands before them
-        grad_occlusion = batch.row(grad_items, 0)
-        if config.refine.residual:
-            grad_occlusion = (
-                grad_logit * refine_occlusion_slope(batch.pad_zeros(inputs.raw_shadows[0])) + grad_occlusion
-            )
-        if config.refine.bias_info:  # its inputs have 1 - occlusion, too, before the other three
-            grad_occlusion -= batch.row(grad_items, config.refine.shape.inputs - 4)
     if grad_albedo:
         parts.append((batch.matrix(grad_albedo), 0, len(grad_albedo)))
-    grad_raw_occlusion = [grad_occlusion] if config.shadow and config.shadow.gradients else []
-    dr.eval(grad_raw_occlusion)
     by_encoding = by_encoding if config.field.embeddings else []
-    grad_raw_occlusion = batch.unpad(grad_raw_occlusion, inputs.means.x)
-    return batch.pack(parts, inputs.features), grad_weights, grad_raw_occlusion, by_encoding, grad_sun
+    return batch.pack(parts, inputs.features), grad_weights, by_encoding, grad_sun
 
 
 def _refine_items(

@@ -39,5 +39,7 @@ def _light(light: JsonDict) -> JsonDict:
         ends = {"beta_min": 0.05} if method.get("kind") == "splatting" else {}
         if method.get("sun_radius_deg") == 0:  # of windows as wide as a penumbra, which are gone
             method = {name: value for name, value in method.items() if name not in ("sun_radius_deg", "widest")}
+        if ends and isinstance(method.get("gradients"), bool):  # through shadows, which only training read
+            method = {name: value for name, value in method.items() if name != "gradients"}
         light["shadow"] = {**shadow, "method": {**ends, **method}}
     return light

@@ -194,7 +194,6 @@ class ViewPass:
         grad_visibility = grad_values.pop("visibility", [None])[0]
         by_sun = self.config.sun == "unknown"
         grad_light = light.adjoint(drawn.shading, grad_values.pop("color"), grad_visibility, by_sun)
-        grad_rows = _sum_rows(grad_light.geometry, grad_rows)
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
@@ -209,9 +208,3 @@ def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, lis
     """So many of the values, one after another, under each name."""
     rest = iter(values)
     return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
-
-
-def _sum_rows(first: list[Float], second: list[Float]) -> list[Float]:
-    """Rows added up, those that only one has as they are."""
-    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    return [row + addend for row, addend in zip(longer, shorter, strict=False)] + longer[len(shorter) :]

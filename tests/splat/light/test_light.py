@@ -2,14 +2,13 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
-from splats import light_of, random_splats, srgb_of
+from splats import light_of, srgb_of
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
@@ -26,8 +25,7 @@ from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceConfig, ViewAloneConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
-from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig, cast_shadows
-from spacesim.splat.light.shadow.light_camera import light_rows
+from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 from spacesim.splat.light.shadow.splatting import occlusion_by_splatting
@@ -59,10 +57,9 @@ CONFIGS = {
     "map": LightConfig(FIELD, ShadowConfig(MappingConfig(), 32, refine=REFINE)),
     "splat": LightConfig(FIELD, ShadowConfig(SplattingConfig(), 32, refine=None)),
     "linear": LightConfig(FIELD, linear=True),
-    "gradients": LightConfig(FIELD, ShadowConfig(SplattingConfig(gradients=True), 32, refine=REFINE)),
     "surface": LightConfig(ON_SURFACE, ShadowConfig(MappingConfig(), 32, grazing="lift", refine=REFINE)),
     "printed": LightConfig(  # 4.13 as the thesis has it
-        FIELD, ShadowConfig(SplattingConfig(gradients=True), 32, refine=replace(REFINE, residual=False))
+        FIELD, ShadowConfig(SplattingConfig(), 32, refine=replace(REFINE, residual=False))
     ),
     "bounce": LightConfig(ON_SURFACE, ShadowConfig(SplattingConfig(), 32, refine=REFINE), bounce=7),
     "bounce, linear": LightConfig(ON_SURFACE, bounce=5, linear=True),
@@ -352,11 +349,9 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
     rng = np.random.default_rng(5)
     grad_color, grad_visibility = rng.normal(size=(count, 3)), rng.normal(size=count) * bool(raw)
     given = upload(grad_visibility) if raw else None
-    if raw:
-        shading.shadows = SimpleNamespace(adjoint=lambda grad_occlusion: [grad_occlusion])
     back = light.adjoint(shading, [upload(column) for column in grad_color.T], given)
 
-    def loss(arrays: dict, weights: list[np.ndarray], raw: list[np.ndarray] = raw, own: np.ndarray = own) -> float:
+    def loss(arrays: dict, weights: list[np.ndarray], own: np.ndarray = own) -> float:
         color, visibility, _ = twin(light, arrays, weights, raw, given_light, own, earth)
         return float((grad_color * color).sum() + grad_visibility @ visibility)
 
@@ -380,11 +375,6 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
             assert gradient[3] @ unit == pytest.approx(slope, rel=2e-3, abs=2e-3)
         assert np.abs(gradient[3]).max() > 0.01
         assert not gradient[[0, 1, 2, 4]].any(), "of the other pictures"
-    assert len(back.geometry) == bool(light.config.shadow and light.config.shadow.gradients)
-    if back.geometry:
-        step = rng.normal(size=count) * (np.abs(raw[0] - 0.5) < 0.479)  # off the corners at `SURE`
-        slope = difference(lambda h: loss(arrays, weights, [raw[0] + h * step, *raw[1:]]))
-        assert numbers(back.geometry[0]) @ step == pytest.approx(slope, rel=2e-3, abs=2e-3)
 
 
 def difference(function) -> float:
@@ -466,7 +456,7 @@ def test_an_untrained_refinement_passes_raw_shadows_on():
 
 def test_a_refinement_as_printed_begins_as_any_network():
     trained = TrainingFrame(np.zeros(3), 1.0, 5.0, 3.0)
-    last = [LightModel.initial(CONFIGS[name], trained, 0).weights[-2] for name in ("gradients", "printed")]
+    last = [LightModel.initial(CONFIGS[name], trained, 0).weights[-2] for name in ("map", "printed")]
     assert not numbers(last[0]).any()
     assert numbers(last[1]).std() > 0.1
 
@@ -690,7 +680,7 @@ def test_round_gaussians_feel_no_pull_towards_roundness():
     assert numbers(anisotropy(ad.Array3f(flat)))[0] == pytest.approx((0.2 + 0.1 + 0.3) / 3, rel=1e-5)
 
 
-MOVING, WIDER = SplattingConfig(gradients=True), SplattingConfig(beta_min=0.004)
+WIDER = SplattingConfig(beta_min=0.004)
 PRINTED = replace(REFINE, residual=False)
 SPLATTED = LightConfig(FIELD, ShadowConfig(SplattingConfig(), 32, refine=REFINE))
 
@@ -700,14 +690,13 @@ SPLATTED = LightConfig(FIELD, ShadowConfig(SplattingConfig(), 32, refine=REFINE)
     [
         ("light.weight.05", {"visibility_weight": 1.0}),
         ("features", {"light": replace(SPLATTED, linear=True)}),
-        ("means", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, method=MOVING))}),
         ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, grazing="lift"))}),
         ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, bias=0.0))}),
         ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, crop=False))}),
         ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, method=WIDER))}),
         ("features", {"light": replace(SPLATTED, shadow=replace(SPLATTED.shadow, refine=PRINTED))}),
     ],
-    ids=["supervised", "linear", "gradients", "grazing", "bias", "crop", "beta_min", "residual"],
+    ids=["supervised", "linear", "grazing", "bias", "crop", "beta_min", "residual"],
 )
 def test_every_option_changes_what_is_learned(small_lit_dataset, tensor, changes):
     learned = []
@@ -736,24 +725,6 @@ def test_a_footprint_ends_within_what_lists_hold():
     for wrong in (0.003, 0.6):
         with pytest.raises(InputError, match=f"beta_min: expected 0.004 to 0.5, found {wrong}"):
             SplattingConfig(beta_min=wrong)
-
-
-def test_shadow_gradients_are_those_of_the_occlusion():
-    """By central differences of the whole of what casts shadows, light camera and bias held."""
-    arrays = random_splats(30, seed=4)
-    config, light = ShadowConfig(MOVING, 32, bias=0.0, refine=None), light_rows([0.2, -0.3, 0.9])
-    shadows = cast_shadows(Gaussians.from_numpy(arrays), light, config, 3.0)
-    grad_rows = shadows.adjoint(upload(np.ones(30, np.float32)))
-    opacity = np.array(grad_rows[10])
-    assert np.abs(opacity).max() > 1e-3
-    for index in np.argsort(-np.abs(opacity))[:5]:
-        sums = []
-        for step in (0.05, -0.05):
-            moved = {name: values.copy() for name, values in arrays.items()}
-            moved["logit_opacities"][index] += step
-            found = cast_shadows(Gaussians.from_numpy(moved), light, config, 3.0).occlusion
-            sums.append(float(np.array(found, np.float64).sum()))
-        assert opacity[index] == pytest.approx((sums[0] - sums[1]) / 0.1, rel=0.1)
 
 
 @pytest.mark.parametrize("kind", ["empty", "no features", "few features"])

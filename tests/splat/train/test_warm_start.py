@@ -17,7 +17,6 @@ from spacesim.data.images import load_image
 from spacesim.data.mesh import SignedDistance
 from spacesim.data.records import Camera
 from spacesim.data.store import load_truth
-from spacesim.splat.light.shadow.cast import SplattingConfig
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
@@ -556,14 +555,9 @@ def test_a_misplaced_prior_is_refused(small_dataset, tmp_path, scale, shift, sai
 
 
 def test_methods_of_light_take_them_all(small_lit_dataset):
-    """Attraction, depth and normals beside shadows, whose gradients move Gaussians too; one step and a resume."""
-    light = preset("demo", "shadow-splat")
-    assert light.light is not None
-    assert light.light.shadow is not None
-    shadow = replace(light.light.shadow, method=SplattingConfig(gradients=True))
+    """Attraction, depth and normals beside shadows."""
     config = replace(
-        light,
-        light=replace(light.light, shadow=shadow),
+        preset("demo", "shadow-splat"),
         iterations=6,
         init_count=200,
         warm_start=replace(WARM, steps=4, decay=1),

@@ -26,7 +26,6 @@ from spacesim.splat.light.shadow.splatting import (
     BETA_MIN,
     LEAST_BETA,
     Receivers,
-    differentiable_occlusion,
     make_events,
     occlude,
     occlusion_by_splatting,
@@ -47,7 +46,6 @@ class SplattingConfig:
 
     kind: ClassVar[str] = "splatting"
 
-    gradients: bool = False  #: training moves the Gaussians through their shadows, too, where the literature stops it
     beta_min: float = BETA_MIN  #: beta at which a receiver's footprint ends; 4.10 names no end, pictures' is 0.004
     #: in a light as table 4.3 has it: names the method baseline-park, and changes no picture
     baseline: bool = field(default=False, metadata={"option": False})
@@ -89,38 +87,20 @@ class ShadowConfig:
         if not 0 < self.softness < math.inf:
             raise InputError(f"softness: expected a number above 0, found {self.softness}")
 
-    @property
-    def gradients(self) -> bool:
-        """Whether training moves the Gaussians through their shadows."""
-        return isinstance(self.method, SplattingConfig) and self.method.gradients
-
 
 @dataclass
 class Shadows:
     """Raw occlusion of Gaussians, and what it was computed with."""
 
     occlusion: Float  #: Float [N] in [0, 1], detached
-    rows: list[Float]  #: the Gaussians' rows but for colours, 11 arrays [N]
     camera: Orthographic  #: the light camera
     bias: Bias  #: of each Gaussian
     points: Array3f | None  #: in place of the receivers' means, or None
-    beta_min: float  #: of shadow splatting
 
     @property
     def info(self) -> list[Float]:
         """Normal alignment, light extent (metres), bias (metres): three arrays [N]."""
         return [self.bias.alignment, self.bias.thickness, self.bias.bias]
-
-    def adjoint(self, grad_occlusion: Float) -> list[Float]:
-        """Gradients of `rows` from that of the occlusion [N], by shadow splatting's adjoint: of the blockers' alpha and
-        the receivers' footprints; order, bias and light camera count as given."""
-        rows = [ad.Float(row) for row in self.rows]
-        dr.enable_grad(rows)
-        occlusion = differentiable_occlusion(
-            Gaussians.from_rows(rows), self.camera, self.bias.bias, self.points, beta_min=self.beta_min
-        )
-        dr.backward(occlusion * grad_occlusion)
-        return [dr.grad(row) for row in rows]
 
 
 def cast_shadows(
@@ -129,16 +109,16 @@ def cast_shadows(
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
     distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    capacity, beta_min = round_capacity(gaussians.count), _beta_min(config)
+    capacity = round_capacity(gaussians.count)
     sunlit = _Sunlit(rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity)
     if isinstance(config.method, MappingConfig):
         view, splats, boxes = _light_splats(sunlit, config.method.antialiased)
         receivers = MapReceivers.of(rows, view.points, view.bias.bias, config.softness * distance)
         occlusion = occlusion_in_picture(receivers, (splats, boxes), view.camera, config.method, [], make_lists)
     else:
-        view, events, boxes = _light_events(sunlit, beta_min, dr.opaque(ad.UInt32, gaussians.count))
+        view, events, boxes = _light_events(sunlit, _beta_min(config), dr.opaque(ad.UInt32, gaussians.count))
         occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
-    return Shadows(occlusion, rows, view.camera, view.bias, view.points, beta_min)
+    return Shadows(occlusion, view.camera, view.bias, view.points)
 
 
 @dataclass

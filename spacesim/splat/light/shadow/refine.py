@@ -1,7 +1,7 @@
 """The refinement network's inputs: a raw occlusion to a corrected one (thesis 4.3.3, table 4.2)."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import drjit as dr
 
@@ -57,10 +57,3 @@ def refine_occlusion(config: ShadowRefinementConfig, occlusion: Float, output: F
         return sigmoid(output)
     sure = dr.clip(occlusion, SURE, 1 - SURE)
     return dr.rcp(1 + (1 - sure) / sure * dr.exp(-output))
-
-
-def refine_occlusion_slope(occlusion: Float) -> Float:
-    """d logit(occ) / d occ, 0 where the occlusion is held at `SURE`."""
-    inside = (occlusion > SURE) & (occlusion < 1 - SURE)
-    slope: Any = dr.select(inside, dr.rcp(dr.maximum(occlusion * (1 - occlusion), 1e-6)), 0)
-    return slope

@@ -4,35 +4,21 @@ A Gaussian stands in the light image's lists twice: as a receiver at z - b, its 
 at its depth z. In that order each tile walks its list once: a blocker takes its share of the pixels' light, a receiver
 notes what has been taken so far, weighted by its footprint. Each (tile, receiver) pair sums into a slot of its own, and
 a second pass adds up each receiver's slots in order: the same input gives the same bits.
-
-The adjoint is by hand: it replays the lists from their ends, as `blend.backward` does.
 """
 
 from dataclasses import dataclass
-from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
-from spacesim.data.errors import WorkError
-from spacesim.splat.raster.adjoint import PixelMoments, add_to_slots, gather_slots, reduce_mode
+from spacesim.splat.raster.adjoint import reduce_mode
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
-from spacesim.splat.raster.lists.tiles import ThreadPixels, TileLists, round_capacity, thread_offsets, thread_pixels
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
-from spacesim.splat.raster.records import (
-    ALPHA_MAX,
-    POWER_MIN,
-    TRANSMITTANCE_MIN,
-    ListedRecords,
-    exp2,
-    exponents,
-    list_records,
-    packet_sizes,
-    store,
-)
+from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, TRANSMITTANCE_MIN, exp2, exponents, list_records
 
 BETA_MIN = 0.2  #: a receiver's footprint ends there: 80 % of its weight on 29 % of the area of a cut at 1/255
 TURN = {"cuda": 4, "llvm": 1}  #: events a turn of the loop: their numbers are read at once
@@ -64,24 +50,6 @@ def occlusion_by_splatting(
     0 for what cannot be projected and where no pixel of a footprint is inside of the image. Raises ValueError for a
     bias of another length, WorkError where memory is short.
     """
-    rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    detached = Gaussians.from_rows(rows)
-    return differentiable_occlusion(detached, camera, bias, points, antialiased, receives, beta_min, make_lists)
-
-
-def differentiable_occlusion(
-    gaussians: Gaussians,
-    camera: Orthographic,
-    bias: Float,
-    points: Array3f | None = None,
-    antialiased: bool = False,
-    receives: Bool | None = None,
-    beta_min: float = BETA_MIN,
-    make_lists: MakeLists = bin_splats,
-) -> Float:
-    """`occlusion_by_splatting` with gradients (reverse mode) by means, log scales, quaternions and opacities, of the
-    blockers' alpha and the receivers' beta. Who is before whom, the bias, and by how much `points` are off the centres
-    are taken as given."""
     count = gaussians.count
     if dr.width(bias) not in (1, count):
         raise ValueError(f"bias: expected {count} numbers or one, found {dr.width(bias)}")
@@ -93,20 +61,19 @@ def differentiable_occlusion(
         dr.make_opaque(bias)
     receivers = Receivers(bias, points, beta_min, receives)
     live, capacity = dr.opaque(ad.UInt32, count), round_capacity(count)
-    events, boxes = make_events(gaussians.shape_rows(), receivers, camera, antialiased, live, capacity)
+    rows = [dr.detach(row) for row in gaussians.shape_rows()]
+    events, boxes = make_events(rows, receivers, camera, antialiased, live, capacity)
     return occlude(events, boxes, camera, count, make_lists)
 
 
 def occlude(events: Splats, boxes: Footprints, camera: Orthographic, count: int, make_lists: MakeLists) -> Float:
-    """Float [N]: occlusion of the N = `count` Gaussians of `make_events`, with gradients by the events where these have
-    some."""
+    """Float [N]: occlusion of the N = `count` Gaussians of `make_events`."""
     size = camera.width, camera.height
-    if not dr.grad_enabled(events):
-        return _Walk(events, boxes, size, count, make_lists).occlusion
-    try:
-        return dr.custom(_Occlusion, events, boxes, size, count, make_lists)
-    except RuntimeError as error:  # Dr.Jit wraps what is raised in there
-        raise error.__cause__ if isinstance(error.__cause__, WorkError) else error from None
+    lists = make_lists(events, boxes, *size)
+    if lists.capacity == 0:
+        return dr.opaque(ad.Float, 0, count)
+    occlusion = _walk(events, lists, size, round_capacity(count))
+    return dr.gather(ad.Float, occlusion, dr.arange(ad.UInt32, count))
 
 
 @dataclass
@@ -134,14 +101,13 @@ def make_events(
     index = dr.select(is_receiver, event, event - half)
     live = index < count
     receiving = live & is_receiver
-    of_events = dr.custom(_Twice, rows, index, live) if dr.grad_enabled(rows) else _gather_rows(rows, index, live)
-    x, y, z, *shape, logit = of_events
+    x, y, z, *shape, logit = (dr.gather(ad.Float, row, index, live) for row in rows)
     means = ad.Array3f(x, y, z)
     if receivers.points is not None:
-        away = dr.gather(ad.Array3f, receivers.points, index, receiving) - dr.detach(means)
+        away = dr.gather(ad.Array3f, receivers.points, index, receiving) - means
         means += dr.select(receiving, away, ad.Array3f(0))
     opacity = ALPHA_MIN / receivers.beta_min  # the cut at ALPHA_MIN falls where a receiver's footprint ends
-    ends = is_receiver & (dr.abs(dr.detach(logit)) < MAX_MAGNITUDE)
+    ends = is_receiver & (dr.abs(logit) < MAX_MAGNITUDE)
     logit = dr.select(ends, dr.log(ad.Float(opacity / (1 - opacity))), logit)
     events, boxes = project(
         Gaussians.from_rows([*means, *shape, logit]), camera, ~is_receiver if antialiased else False
@@ -154,77 +120,29 @@ def make_events(
     return events, boxes
 
 
-def _gather_rows(rows: list[Float], index: UInt32, live: Bool) -> list[Float]:
-    return [dr.gather(ad.Float, row, index, live) for row in rows]
-
-
-class _Twice(dr.CustomOp):
-    """`_gather_rows` of events, whose receivers stand before their blockers, as one node of Dr.Jit's graph: the adjoint
-    of two gathers adds to what else there is in an order that nobody knows."""
-
-    def eval(self, rows: list[Float], index: UInt32, live: Bool) -> list[Float]:
-        self.count, self.capacity = dr.width(rows[0]), dr.width(index) // 2
-        return _gather_rows([dr.detach(row) for row in rows], index, live)
-
-    def backward(self) -> None:
-        index = dr.arange(ad.UInt32, self.count)
-        places = index, index + dr.opaque(ad.UInt32, self.capacity)
-        gradients = cast(list[Float], self.grad_out())
-        of_receivers, of_blockers = (_gather_rows(gradients, place, ad.Bool(True)) for place in places)
-        self.set_grad_in("rows", [a + b for a, b in zip(of_receivers, of_blockers, strict=True)])
-
-    def name(self) -> str:
-        return "rows of receivers and blockers"
-
-
 def _depth(means: Array3f, camera: Orthographic) -> Float:
-    """Light depths [N], metres, without the camera's own distance, for sorting: detached, finite, 0 of one sign."""
-    means = dr.detach(means)
+    """Light depths [N], metres, without the camera's own distance, for sorting: finite, 0 of one sign."""
     depth = dr.dot(camera.row(2), dr.select(dr.max(dr.abs(means)) < MAX_MAGNITUDE, means, ad.Array3f(0)))
     return dr.select(depth == 0, 0, depth)
 
 
-@dataclass
-class _WalkTape:
-    """What `_replay` needs of `_walk`.
-
-    Tile-major: transmittance and one past the last blocker of each pixel [T * pixels of a tile].
-    """
-
-    transmittance: Float
-    last: UInt32
-    records: ListedRecords  #: of the events, of whose capacity one half are receivers
-
-
-@dataclass
-class _WalkResult:
-    """What `_walk` leaves behind. occlusion, weight (sum of beta): [capacity]"""
-
-    occlusion: Float
-    weight: Float
-    tape: _WalkTape | None  #: where it was asked for
-
-
-Passed = tuple[list[Float], list[UInt32]]  #: transmittance and one past the last blocker of a thread's pixels
-
-
 @recorded
-def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int, adjoint: bool) -> _WalkResult:
-    """What each receiver has lost; one thread holds a block of a tile's pixels."""
+def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int) -> Float:
+    """[capacity]: what each receiver has lost. One thread holds a block of a tile's pixels."""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
     records = list_records(events, [], lists, 2 * capacity)
     receivers = dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text, as in `make_events`
-    threads, thread = lists.tiles_x * lists.tiles_y * shape.threads, thread_pixels(lists)
-    inside = [_inside(thread, offset, image_size) for offset in thread_offsets(shape)]
+    thread, (width, height) = thread_pixels(lists), image_size
+    inside = [(thread.column + i < width) & (thread.row + j < height) for i, j in thread_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
     mode = reduce_mode(8 * lists.capacity, shape)
     end = dr.gather(ad.UInt32, lists.end, thread.tile)
 
-    def remaining(k: UInt32, _transmittance: object, _last: object) -> Bool:
+    def remaining(k: UInt32, _transmittance: object) -> Bool:
         return k < end
 
-    def note(k: UInt32, powers: list[Float], transmittance: list[Float], last: list[UInt32], active: Bool) -> Passed:
+    def note(k: UInt32, powers: list[Float], transmittance: list[Float], active: Bool) -> list[Float]:
         """What receiver k has lost. All threads note theirs: to ask each whether it has anything to note costs more."""
         lost, weight = ad.Float(0), ad.Float(0)
         for p in range(pixels):
@@ -233,52 +151,37 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
             lost, weight = dr.fma(beta, 1 - transmittance[p], lost), weight + beta
         sums = ad.Array2f(lost, weight)
         dr.scatter_reduce(dr.ReduceOp.Add, slots, sums, lists.sum_index(k, active), active, mode)
-        return transmittance, last
+        return transmittance
 
-    def block(k: UInt32, powers: list[Float], transmittance: list[Float], last: list[UInt32], active: Bool) -> Passed:
+    def block(_k: UInt32, powers: list[Float], transmittance: list[Float], active: Bool) -> list[Float]:
         """What blocker k lets through."""
-        transmittance, last = list(transmittance), list(last)
+        transmittance = list(transmittance)
         for p in range(pixels):
             blocks = active & (powers[p] >= POWER_MIN) & (transmittance[p] > TRANSMITTANCE_MIN)
             passed = transmittance[p] * (1 - dr.minimum(exp2(powers[p]), ALPHA_MAX))
             transmittance[p] = dr.select(blocks, passed, transmittance[p])
-            if adjoint:
-                last[p] = dr.select(blocks, k + 1, last[p])
-        return transmittance, last
+        return transmittance
 
-    def take(k: UInt32, transmittance: list[Float], last: list[UInt32]) -> tuple[UInt32, list[Float], list[UInt32]]:
+    def take(k: UInt32, transmittance: list[Float]) -> tuple[UInt32, list[Float]]:
         listed = [k + u < end if u else ad.Bool(True) for u in range(turn)]
         numbers = [dr.gather(ad.UInt32, lists.splat, k + u, listed[u]) for u in range(turn)]
         loaded = [records.load(lists, k + u, listed[u]) for u in range(turn)]
         for u, record in enumerate(loaded):
             powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < receivers
             if branches:
-                state = k + u, powers, transmittance, last, listed[u]
-                transmittance, last = dr.if_stmt(state, receiver, note, block, mode="symbolic")
+                state = k + u, powers, transmittance, listed[u]
+                transmittance = dr.if_stmt(state, receiver, note, block, mode="symbolic")
             else:
-                note(k + u, powers, transmittance, last, receiver)
-                transmittance, last = block(k + u, powers, transmittance, last, listed[u] & ~receiver)
-        return k + turn, transmittance, last
+                note(k + u, powers, transmittance, receiver)
+                transmittance = block(k + u, powers, transmittance, listed[u] & ~receiver)
+        return k + turn, transmittance
 
-    state = (
-        dr.gather(ad.UInt32, lists.start, thread.tile),
-        [ad.Float(1) for _ in range(pixels)],
-        [ad.UInt32(0) for _ in range(pixels if adjoint else 0)],
-    )
-    _, transmittance, last = dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
-    tape = None
-    if adjoint:
-        tape = _WalkTape(store(transmittance, thread.place, threads), store(last, thread.place, threads), records)
-    dr.eval(slots, tape)
+    state = dr.gather(ad.UInt32, lists.start, thread.tile), [ad.Float(1) for _ in range(pixels)]
+    dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
+    dr.eval(slots)
     lost, weight = _sum_slots(slots, lists, capacity)
     seen = weight > 0
-    occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
-    return _WalkResult(occlusion, weight, tape)
-
-
-def _inside(thread: ThreadPixels, offset: tuple[int, int], image_size: tuple[int, int]) -> Bool:
-    """Is the thread's pixel at an offset from its first one of the picture's?"""
-    return (thread.column + offset[0] < image_size[0]) & (thread.row + offset[1] < image_size[1])
+    return dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
 
 
 def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
@@ -296,113 +199,3 @@ def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
     state = position, ad.Array2f(0)
     _, total = dr.while_loop(state, remaining, add, mode="symbolic", label="sum shadow slots")
     return total
-
-
-@recorded
-def _replay(
-    events: Splats, walked: _WalkResult, lists: TileLists, image_size: tuple[int, int], gradient: Float
-) -> Splats:
-    """Adjoint of `_walk`: from gradients of the occlusions [capacity] to gradients of the events.
-
-    With u_i = dL/d occ_i / sum of beta_i: dL/d beta_i = u_i (1 - T_i - occ_i), and
-    dL/d alpha_j = (sum over receivers i behind j of u_i beta_i T_i) / (1 - alpha_j).
-    """
-    shape, thread, offsets = lists.shape, thread_pixels(lists), thread_offsets(lists.shape)
-    inside, tape = [_inside(thread, offset, image_size) for offset in offsets], walked.tape
-    assert tape is not None, "the way through the lists has kept nothing for its adjoint"
-    places = [thread.place * shape.pixels + p for p in range(shape.pixels)]
-    transmittance = [dr.gather(ad.Float, tape.transmittance, place) for place in places]
-    last = [dr.gather(ad.UInt32, tape.last, place) for place in places]
-    shares = dr.select(walked.weight > 0, gradient / dr.maximum(walked.weight, 1e-30), 0)
-    dr.eval(shares)
-    slots = [dr.zeros(ad.Float, size * lists.capacity) for size in packet_sizes(6)]
-    mode = reduce_mode(32 * lists.capacity, shape)
-    start = dr.gather(ad.UInt32, lists.start, thread.tile)
-    receivers = dr.opaque(ad.UInt32, tape.records.capacity // 2)
-
-    def remaining(k: UInt32, _transmittance: object, _behind: object) -> Bool:
-        return k > start
-
-    def replay(k: UInt32, transmittance: list[Float], behind: list[Float]) -> tuple[UInt32, list[Float], list[Float]]:
-        k = k - 1
-        event = dr.gather(ad.UInt32, lists.splat, k)
-        record, receiver = tape.records.load(lists, k), event < receivers
-        powers = exponents(record, thread.x, thread.y, shape)
-        share = dr.gather(ad.Float, shares, event, receiver)
-        occlusion = dr.gather(ad.Float, walked.occlusion, event, receiver)
-        transmittance, behind = list(transmittance), list(behind)
-        moments = PixelMoments(thread.x - record[0], thread.y - record[1])
-        for p, offset in enumerate(offsets):
-            unclamped = exp2(powers[p])
-            alpha = dr.minimum(unclamped, ALPHA_MAX)
-            reached = powers[p] >= POWER_MIN
-            receives, blocks = reached & receiver & inside[p], reached & ~receiver & (k < last[p])
-            weight = dr.select(receives, alpha * share, 0)
-            inverse = dr.rcp(1 - dr.select(blocks, alpha, 0))
-            grad_log_beta = weight * (1 - transmittance[p] - occlusion)  # dL / d ln beta
-            # dL / d ln alpha
-            grad_log_alpha = dr.select(blocks & (unclamped < ALPHA_MAX), behind[p] * inverse * alpha, 0)
-            behind[p] = dr.fma(weight, transmittance[p], behind[p])
-            transmittance[p] *= inverse
-            moments.add(*offset, grad_log_beta + grad_log_alpha)
-        add_to_slots(slots, moments.sums(), lists.sum_index(k), mode)
-        return k, transmittance, behind
-
-    state = dr.gather(ad.UInt32, lists.end, thread.tile), transmittance, [ad.Float(0) for _ in offsets]
-    dr.while_loop(state, remaining, replay, mode="symbolic", label="replay shadow")
-    dr.eval(slots)
-    gradients: Splats = gather_slots(slots, events, lists, 0, absolute=False).splats
-    return gradients
-
-
-class _Walk:
-    """Lists of the events of `count` Gaussians, and what was found on the way through them."""
-
-    def __init__(
-        self,
-        events: Splats,
-        boxes: Footprints,
-        size: tuple[int, int],
-        count: int,
-        make_lists: MakeLists,
-        adjoint: bool = False,
-    ) -> None:
-        self.events, self.size, self.count, self.capacity = events, size, count, round_capacity(count)
-        self.lists = make_lists(events, boxes, *size)
-        self.result: _WalkResult | None = None
-        if self.lists.capacity > 0:
-            self.result = _walk(events, self.lists, self.size, self.capacity, adjoint)
-
-    @property
-    def occlusion(self) -> Float:
-        """[N]"""
-        if self.result is None:
-            return dr.opaque(ad.Float, 0, self.count)
-        return dr.gather(ad.Float, self.result.occlusion, dr.arange(ad.UInt32, self.count))
-
-    def adjoint(self, grad_occlusion: Float) -> Splats:
-        """Gradients of the events from that of the occlusion [N]."""
-        if self.result is None:
-            zero = dr.opaque(ad.Float, 0, 2 * self.capacity)
-            return Splats(x=zero, y=zero, a=zero, b=zero, c=zero, opacity=zero, depth=zero)
-        receiver = dr.arange(ad.UInt32, self.capacity)
-        padded = dr.gather(ad.Float, grad_occlusion, receiver, receiver < dr.opaque(ad.UInt32, self.count))
-        return _replay(self.events, self.result, self.lists, self.size, padded)
-
-
-class _Occlusion(dr.CustomOp):
-    """From events [2 capacity] to occlusions [N], as one node of Dr.Jit's graph. Differentiable in reverse mode."""
-
-    def eval(
-        self, events: Splats, boxes: Footprints, size: tuple[int, int], count: int, make_lists: MakeLists
-    ) -> Float:
-        self.walk = _Walk(dr.detach(events), boxes, size, count, make_lists, adjoint=True)
-        return self.walk.occlusion
-
-    def backward(self) -> None:
-        gradients = self.walk.adjoint(cast(Float, self.grad_out()))
-        gradients.depth = dr.opaque(ad.Float, 0, dr.width(gradients.x))
-        self.set_grad_in("events", gradients)
-
-    def name(self) -> str:
-        return "occlusion by splatting"
