@@ -2,6 +2,7 @@
 
 OUT/rgb/0000.png         sRGB, 8 bits, straight alpha
 OUT/depth/0000.exr       float: depth, metres along the optical axis, 0 where nothing is; alpha
+OUT/linear/0000.exr      linear display values, alpha; of scenes blended in linear light (`light.linear`)
 OUT/id/0000.png          which model: its number, from 1, in the file's order, 0 for none
 OUT/visibility/0000.png  share of the Sun that is seen, 255 all of it, 0 where nothing is; of scenes with shadows
 OUT/shots/0000.json      when that was: time, camera as in transforms.json, Sun, poses; written last
@@ -36,7 +37,7 @@ from spacesim.splat.export.video import INSTALL, Video, encoder
 from spacesim.version import __version__
 
 SHOTS = "shots"
-PICTURES = {"rgb": ".png", "depth": ".exr", "id": ".png", "visibility": ".png"}
+PICTURES = {"rgb": ".png", "depth": ".exr", "linear": ".exr", "id": ".png", "visibility": ".png"}
 
 log = logging.getLogger(__name__)
 
@@ -195,9 +196,12 @@ def _write(out: Path, index: int, frame: SceneFrame, what: dict[str, JsonValue],
     planes = _planes(prediction)
     write_picture(prediction, "rgb", out / "rgb" / f"{index:04d}.png")
     write_exr(out / "depth" / f"{index:04d}.exr", {"depth": prediction.depth, "alpha": prediction.alpha})
+    written = ["rgb", "depth", *planes]
+    if prediction.linear is not None:
+        write_exr(out / "linear" / f"{index:04d}.exr", {"linear": prediction.linear, "alpha": prediction.alpha})
+        written.append("linear")
     for kind, plane in planes.items():
         write_png(out / kind / f"{index:04d}.png", plane)
-    written = ["rgb", "depth", *planes]
     for kind in PICTURES.keys() - written:
         (out / kind / f"{index:04d}{PICTURES[kind]}").unlink(missing_ok=True)
     write_json(record, {**what, "pictures": written})

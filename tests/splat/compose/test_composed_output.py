@@ -87,6 +87,9 @@ def test_pictures_of_linear_models_are_exposed_as_asked_for(tmp_path):
     once, doubled = (shot.composition.predict(shot.camera, SUN, exposure=ev).rgb for ev in (None, 1.0))
     np.testing.assert_allclose(linear_from_srgb(doubled), np.minimum(2 * linear_from_srgb(once), 1), atol=1e-4)
     compose(linear, tmp_path / "out")
+    light, seen = read_exr(tmp_path / "out/linear/0000.exr"), shot.composition.predict(shot.camera, shot.sun)
+    assert np.array_equal(light["linear"], seen.linear)
+    assert np.array_equal(light["alpha"], seen.alpha)
     before = read_png(tmp_path / "out/rgb/0000.png")
     assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 1
     assert compose(linear, tmp_path / "out", exposure=1.0).rendered == 0
