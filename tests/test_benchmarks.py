@@ -23,7 +23,7 @@ from tiny import Outcome, captured, outcome
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
-from spacesim.data.images import load_image, read_png, write_png
+from spacesim.data.images import linear_from_srgb, load_image, read_png, write_png
 from spacesim.data.importers.writing import ImportedFrame, write_dataset
 from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.data.store import read_dataset, read_points
@@ -408,6 +408,33 @@ def test_suns_compares_the_same_number_of_pictures(command, place):
     unseen = {tuple(frame.sun.direction) for frame in read_dataset(place / "OUT/unseen").test}
     assert len(unseen) == 8
     assert not unseen & {tuple(frame.sun.direction) for frame in read_dataset(place / "OUT/data-8").train}
+
+
+@smallest(
+    "exposures.py --out OUT --suns 2 --views 2 --resolution 32 --samples 4 --preset demo --iterations 3 --seeds 2"
+    " --rows '0 EV, radiance,varied, as if alike,varied, given, linear' --backend llvm --json"
+)
+def test_exposures_vary_and_are_named_where_the_rows_say_so(command, place):
+    rows = json.loads(call(command))["rows"]
+    assert [row.pop("pictures, trained on") for row in rows] == [
+        "0 EV, radiance",
+        "varied, as if alike",
+        "varied, given, linear",
+    ]
+    for row in rows:
+        assert len(row) == 12
+        assert min(row.values()) >= 0
+    same, named, hidden = (read_dataset(place / "OUT" / name) for name in ("0 EV", "varied", "varied, not named"))
+    factors = np.array([frame.exposure for frame in named.train]) / named.scene["exposure"]
+    assert np.ptp(np.log2(factors)) > 0.5
+    assert np.log2(factors).mean() == pytest.approx(0, abs=1e-9)
+    assert {frame.exposure for frame in (*same.train, *named.test, *hidden.train)} == {None}
+    for k in (factors.argmin(), factors.argmax()):
+        images = [load_image(data, data.train[k]) for data in (same, named, hidden)]
+        once, varied, other = (linear_from_srgb(image.rgb) for image in images)
+        np.testing.assert_array_equal(varied, other)
+        bright = (once.min(axis=2) > 0.02) & (np.maximum(once, varied).max(axis=2) < 0.98) & (images[0].alpha == 1)
+        assert np.median(varied[bright] / once[bright]) == pytest.approx(factors[k], rel=0.05)
 
 
 @smallest(

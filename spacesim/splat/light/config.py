@@ -1,6 +1,7 @@
 """How light becomes colour: the configuration of a relightable model."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as with_default
 
 from spacesim.data.errors import InputError
 from spacesim.data.images.tone import PEAK, STANDARD_EXPOSURE, WHITES, Curve, Tone
@@ -17,7 +18,7 @@ MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
 class LightConfig:
     """How light becomes colour."""
 
-    field: FieldConfig = field(default_factory=FieldConfig)  #: the network that gives colours
+    field: FieldConfig = with_default(default_factory=FieldConfig)  #: the network that gives colours
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
     #: so many of the Gaussians, each for those around it, scatter sunlight once onto all that see them; 0 for none
     bounce: int = 0
@@ -34,8 +35,11 @@ class LightConfig:
     tone: Tone | None = None
     #: EV of the pictures trained on, of linear colours; none: the dataset's own, which `train` fills in, else 0
     exposure: float | None = None
-    #: learn from radiance (gt/*.exr), not from 8-bit pictures, compared by the mu-law: colours reach 16 times white
+    #: learn from radiance (gt/*.exr), not from 8-bit pictures, by sRGB values that go on beyond white as logarithms:
+    #: colours reach 16 times white
     radiance: bool = False
+    #: the field gives linear colours encoded (`bounce.field_color`); older runs did not
+    encoded: bool = with_default(default=True, metadata={"option": False})
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -64,6 +68,12 @@ class LightConfig:
         """How linear colours are shown, None of others."""
         tone: Tone = self.tone or "srgb"
         return Curve(tone, self.exposure or 0.0, PEAK if self.radiance else WHITES[tone]) if self.linear else None
+
+    @property
+    def encoding(self) -> str | None:
+        """How the field gives colours: linear ones as "srgb" values or, up to PEAK, by `encode_radiance` ("radiance");
+        None where as they are."""
+        return ("radiance" if self.radiance else "srgb") if self.linear and self.encoded else None
 
     @property
     def peaks(self) -> float | None:

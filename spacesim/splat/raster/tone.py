@@ -12,9 +12,11 @@ import numpy as np
 
 from spacesim.backend.arrays import ArrayT
 from spacesim.data.images import srgb_from_linear
-from spacesim.data.images.tone import MU, WHITES, filmic
+from spacesim.data.images.tone import PEAK, WHITES, filmic
 
 _LINEAR_END, _ENCODED_END = 0.0031308, 0.04045
+_SLOPE_AT_WHITE = 1.055 / 2.4  # of sRGB values by light
+ENCODED_PEAK = 1 + _SLOPE_AT_WHITE * math.log(PEAK)  #: of `encode_radiance`
 
 
 def tone_map(light: ArrayT, tone: str, white: float | None = None) -> ArrayT:
@@ -46,10 +48,24 @@ def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0, white: flo
     return srgb_from_linear(filmic(v) if tone == "filmic" else v)
 
 
-def mu_law(light: ArrayT) -> ArrayT:
-    """`spacesim.data.images.tone.mu_law` of linear colours that are shares of PEAK, 0 or more. It goes on beyond 1,
-    ever flatter: a glint 100 times as bright has 1.54. Arrays of any shape."""
-    return dr.log(dr.fma(light, MU, 1)) / math.log1p(MU)
+def encode_radiance(light: ArrayT) -> ArrayT:
+    """What is compared of colours that are shares of PEAK, 0 or more: sRGB values up to white, beyond it logarithms
+    that go on with the slope there, ENCODED_PEAK at PEAK. Arrays of any shape."""
+    v = PEAK * light
+    beyond = dr.fma(_SLOPE_AT_WHITE, dr.log(dr.maximum(v, 1)), 1)
+    return cast(ArrayT, dr.select(v < 1, encode_srgb_unclipped(dr.minimum(v, 1)), beyond))
+
+
+def decode_radiance(values: ArrayT) -> ArrayT:
+    """The inverse: colours, shares of PEAK. Arrays of any shape."""
+    beyond = dr.exp((dr.maximum(values, 1) - 1) / _SLOPE_AT_WHITE)
+    return cast(ArrayT, dr.select(values < 1, decode_srgb(dr.minimum(values, 1)), beyond) / PEAK)
+
+
+def decode_radiance_slope(values: ArrayT) -> ArrayT:
+    """d `decode_radiance`. Arrays of any shape."""
+    beyond = dr.exp((dr.maximum(values, 1) - 1) / _SLOPE_AT_WHITE) / _SLOPE_AT_WHITE
+    return cast(ArrayT, dr.select(values < 1, decode_srgb_slope(dr.minimum(values, 1)), beyond) / PEAK)
 
 
 def encode_srgb(linear: ArrayT) -> ArrayT:

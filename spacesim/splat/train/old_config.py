@@ -25,6 +25,8 @@ def in_this_layout(values: JsonMapping) -> JsonDict:
 
 def _light(light: JsonDict) -> JsonDict:
     field, shadow = light.get("field"), light.get("shadow")
+    if light.get("linear") is True:
+        light = {"encoded": False, **light}
     if isinstance(field, Mapping) and isinstance(field.get("surface"), bool):
         field = dict(field)
         kind = "surface" if field.pop("surface") else "directions"

@@ -16,7 +16,7 @@ from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.render import view_colors
 from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
-from spacesim.splat.raster.tone import decode_srgb, inverse_tone_map, mu_law, tone_map
+from spacesim.splat.raster.tone import decode_srgb, encode_radiance, inverse_tone_map, tone_map
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.loss.photometric import photometric_loss
 from spacesim.splat.train.loss.terms import TruthPlanes, depth_loss, normal_loss, visibility_loss
@@ -92,7 +92,7 @@ class LossSettings:
     scale: float  #: metres, the unit of depth
     tone: str | None  #: curve of colours that are blended, with the background, in linear light, or None
     supersample: int = 1  #: places on a side of each pixel, see `pixel_means`
-    #: shares of PEAK of a radiance of 1 W m^-2 sr^-1: radiance is compared, by `mu_law`; None: 8-bit pictures are
+    #: shares of PEAK of a radiance of 1 W m^-2 sr^-1: radiance is compared (`encode_radiance`); None: 8-bit pictures
     radiance: float | None = None
     downscale: int = 1  #: pixels of the target on a side of each pixel that is compared
 
@@ -130,7 +130,7 @@ def picture_loss(
         color *= ad.Array3f([dr.gather(ad.Float, gains, ad.UInt32(c)) for c in range(3)])
     picture = dr.select(valid, color + transmittance * below, truth)
     if config.radiance is not None:
-        picture, truth = mu_law(picture), mu_law(truth)
+        picture, truth = encode_radiance(picture), encode_radiance(truth)
     elif config.tone:
         picture, truth = tone_map(picture, config.tone), tone_map(truth, config.tone)
     loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)

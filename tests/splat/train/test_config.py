@@ -30,10 +30,10 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "25830fd4bbe3b5ec",
-    "fast": "87074795f5c40b68",
-    "fine": "a58855d6d8c21890",
-    "thesis": "0678849f4024597f",
+    "demo": "17b365dd7cf2cf7a",
+    "fast": "2309e37a1883f6f6",
+    "fine": "d1eb161ced4689da",
+    "thesis": "d211ef461c15871c",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
 HASHED = (
@@ -99,6 +99,15 @@ def test_an_older_run_may_have_had_gradients_through_shadows(gradients):
     newer = config.to_json()
     older["light"]["shadow"]["gradients"] = newer["light"]["shadow"]["method"]["gradients"] = gradients
     assert TrainConfig.from_json(older) == TrainConfig.from_json(newer) == config
+
+
+def test_older_runs_in_linear_light_gave_colors_as_they_are():
+    config = with_settings(preset("fast", "shadow-splat"), {"light.linear": True})
+    assert config.light.encoded
+    values = config.to_json()
+    assert TrainConfig.from_json(values) == config
+    del values["light"]["encoded"]
+    assert not TrainConfig.from_json(values).light.encoded
 
 
 @pytest.mark.parametrize("method", ["shadow-map", "shadow-splat", "baseline-park"])

@@ -1,7 +1,7 @@
-"""Training on radiance: the mu-law against its formula, gradients against differences, pictures brighter than white."""
+"""Training on radiance: what is compared against its formula, slopes against differences, pictures brighter than
+white."""
 
 import json
-import math
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -14,14 +14,12 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.images import read_exr, srgb_from_linear, write_exr
 from spacesim.data.images.tone import (
-    MU,
     PEAK,
     STANDARD_EXPOSURE,
     TONES,
     WHITES,
     display_values,
     linear_from_display,
-    mu_law,
 )
 from spacesim.learning.pictures import write_picture
 from spacesim.splat.export.sweep import suns_around, sweep
@@ -42,8 +40,10 @@ FIELD = FieldConfig(features=4, width=8)
 
 
 def encoded(share: np.ndarray) -> np.ndarray:
-    """The formula of Kalantari and Ramamoorthi 2017 for shares of the peak, in float64."""
-    return np.log(1 + 5000 * np.asarray(share, np.float64)) / math.log(5001)
+    """Of shares of the peak, in float64: sRGB values (IEC 61966-2-1), beyond white 1 + 1.055 / 2.4 ln v."""
+    v = PEAK * np.asarray(share, np.float64)
+    curve = np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.clip(v, 0, 1) ** (1 / 2.4) - 0.055)
+    return np.where(v < 1, curve, 1 + 1.055 / 2.4 * np.log(np.maximum(v, 1)))
 
 
 def config(**options) -> TrainConfig:
@@ -51,19 +51,22 @@ def config(**options) -> TrainConfig:
     return TrainConfig(light=light, iterations=3, init_count=100)
 
 
-def test_the_law_equals_its_formula_and_its_slope_central_differences():
+def test_what_is_compared_equals_its_formula_and_slopes_central_differences():
     shares = np.concatenate([[0, 1e-5, 1e-3], np.linspace(0.01, 1, 40), [3, 50, 1e4]])  # beyond the peak, too
     light = upload(shares)
     dr.enable_grad(light)
-    found = tone.mu_law(light)
-    np.testing.assert_allclose(np.array(dr.detach(found)), encoded(shares), atol=2e-6)
-    np.testing.assert_allclose(mu_law(PEAK * shares), encoded(shares), atol=1e-12)
+    found = tone.encode_radiance(light)
+    values = np.array(dr.detach(found))
+    np.testing.assert_allclose(values, encoded(shares), atol=2e-6, rtol=1e-6)
     dr.backward(dr.sum(found))
     step = 1e-6 * np.maximum(shares, 1e-3)
     slopes = (encoded(shares + step) - encoded(shares - step)) / (2 * step)
-    np.testing.assert_allclose(np.array(dr.grad(light)), slopes, rtol=1e-4)
-    assert slopes.min() > 0
-    assert (encoded(0), encoded(1), MU, PEAK) == (0, 1, 5000, 16)
+    np.testing.assert_allclose(np.array(dr.grad(light))[1:], slopes[1:], rtol=1e-4)
+    assert np.array(dr.grad(light))[0] == pytest.approx(12.92 * PEAK)
+    assert encoded(1) == pytest.approx(tone.ENCODED_PEAK)
+    np.testing.assert_allclose(np.array(tone.decode_radiance(upload(values))), shares, rtol=2e-5)
+    slopes = np.array(tone.decode_radiance_slope(upload(values)))
+    np.testing.assert_allclose(slopes[1:] * np.array(dr.grad(light))[1:], 1, rtol=1e-4)
 
 
 @pytest.mark.parametrize("curve", TONES)
