@@ -276,25 +276,29 @@ def test_each_model_keeps_its_own_filter():
     assert sums[0] < 0.8 * sums[1]
 
 
-def radiant(seed: int) -> Run:
-    """The linear run, as if it had learned radiance."""
+def linear_run(seed: int, radiance: bool) -> Run:
+    """The linear run, whose field gives shares of white, or of the peak, as if it had learned radiance."""
     run = made_run("linear", seed)
     light = run.light
-    config = replace(light.config, radiance=True)
+    config = replace(light.config, radiance=radiance, encoded=False)
     return replace(run, light=LightModel(config, light.weights, light.frame, light.embeddings))
 
 
 def test_runs_that_learned_radiance_keep_their_light():
     pose, below = Pose(translation=[0, 2.5, 0]), 1 / 32
-    both = GaussianComposition([PlacedRun(radiant(1)), PlacedRun(radiant(2), pose)])
-    plain = GaussianComposition([PlacedRun(made_run("linear", 1)), PlacedRun(made_run("linear", 2), pose)])
+    both, plain = (
+        GaussianComposition([PlacedRun(linear_run(1, radiance)), PlacedRun(linear_run(2, radiance), pose)])
+        for radiance in (True, False)
+    )
     seen = both.predict(EYE, SUN, exposure=-5.0)
     assert (seen.linear.max() > 0.1 * 16 * below, seen.id.max()) == (True, 2)
     np.testing.assert_allclose(srgb_from_linear(seen.linear), seen.rgb, atol=1e-5)
     colors = linear_from_srgb(plain.predict(EYE, SUN).rgb)  # the same shares, there of white
     np.testing.assert_allclose(seen.linear, 16 * below * colors, atol=2e-4)
     np.testing.assert_allclose(plain.predict(EYE, SUN).linear, colors, atol=2e-4)  # white is 1
-    mixed = GaussianComposition([PlacedRun(radiant(1)), PlacedRun(made_run("vanilla", 2), pose)]).predict(EYE, SUN)
+    mixed = GaussianComposition([PlacedRun(linear_run(1, True)), PlacedRun(made_run("vanilla", 2), pose)]).predict(
+        EYE, SUN
+    )
     assert mixed.linear is None
     light = np.array([0.001, 0.02, 0.3, 1])  # beyond white is white before it is blended with sRGB values
     (shown,) = display_colors([ad.Float(light)], Curve("srgb", 0.0, 16.0), None)

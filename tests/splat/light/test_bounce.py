@@ -10,6 +10,7 @@ from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
@@ -187,7 +188,8 @@ def shining(splats: Gaussians, specular: float, **more) -> tuple[Gaussians, Ligh
     arrays["features"] = np.column_stack([arrays["features"], logit])
     light = model(LightConfig(FIELD, bounce=GLOW.bounce, gloss=True, linear=True, **more))
     light.weights = [ad.Float(0) * weight for weight in light.weights]
-    light.weights[-1] = ad.Float([np.log(0.6 / 0.4)] * 3)
+    value = srgb_from_linear(np.float64(0.6))
+    light.weights[-1] = ad.Float([float(np.log(value / (1 - value)))] * 3)
     return Gaussians.from_numpy(arrays), light
 
 
