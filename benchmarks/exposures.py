@@ -7,9 +7,9 @@ boxsat as in shadows.py, in three sets of pictures: "0 EV", where white is a whi
 eight times as bright, which clips what is well lit; "varied", where each training picture has its own exposure, within
 1 EV of the first's (uniform, mean 0), developed from the path-traced light. Trained: sRGB values; `light.linear`; and
 `light.radiance`, from EXR. Of varied pictures: as if they were alike, with exposures given, and fitted. PSNR of sRGB
-values and of mu-law encoded light (to 4 EV above white), over the silhouette, and BER: views under Suns of training,
-and under 8 never seen, with the set's first exposure. With several seeds, of training: means and deviations. What is
-done already is not done again.
+values and of mu-law encoded light (to 4 EV above white), over the silhouette, BER, errors of the shadow masks: views
+under Suns of training, and under 8 never seen, with the set's first exposure. With several seeds, of training: means
+and deviations. What is done already is not done again.
 """
 
 import os
@@ -49,7 +49,12 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {  # pictures and settings
     "varied, fitted, linear": ("varied, not named", {**LINEAR, **FITTED}),
 }
 SUNS = {"known": "known_suns", "unseen": "unseen_suns"}
-METRICS = {"PSNR": ("image", "psnr"), "PSNR-mu": ("image", "psnr_mu"), "BER": ("shadow", "ber")}
+METRICS = {
+    "PSNR": ("image", "psnr"),
+    "PSNR-mu": ("image", "psnr_mu"),
+    "BER": ("shadow", "ber"),
+    "mask error": ("shadow_mask", "error_rate"),
+}
 COLUMNS = {
     f"{heading}, {label}": (part, *names, "mean") for label, part in SUNS.items() for heading, names in METRICS.items()
 }

@@ -1,6 +1,6 @@
 """Of so many training pictures, how many Suns should there be?
 
-    python benchmarks/suns.py --out OUT [--pictures 640] [--suns 4,16,64,640] [--resolution 256] [--samples 1024]
+    python benchmarks/suns.py --out OUT [--pictures 640] [--suns 4,16,64,320,640] [--resolution 256] [--samples 1024]
                               [--method shadow-splat] [--preset fast] [--iterations N] [--seeds 1] [--json]
 
 boxsat. Every row has as many training pictures, of few Suns with many views each or of many with few, and is evaluated
@@ -35,7 +35,7 @@ def main() -> None:
     parser = common.arguments(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
     parser.add_argument("--pictures", type=common.positive, default=640, help="for training, in each row (640)")
-    parser.add_argument("--suns", default="4,16,64,640", help="of the rows, commas between (4,16,64,640)")
+    parser.add_argument("--suns", default="4,16,64,320,640", help="of the rows, commas between (4,16,64,320,640)")
     parser.add_argument("--resolution", type=common.positive, default=256, metavar="PX", help="of the pictures (256)")
     parser.add_argument("--samples", type=common.positive, default=1024, metavar="N", help="of test pictures (1024)")
     parser.add_argument("--method", choices=METHODS, default="shadow-splat")

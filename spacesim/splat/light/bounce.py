@@ -16,16 +16,7 @@ from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.surroundings import Surroundings, ray_count
 from spacesim.splat.raster.records import load, packet
-from spacesim.splat.raster.tone import (
-    ENCODED_PEAK,
-    decode_radiance,
-    decode_radiance_slope,
-    decode_srgb,
-    decode_srgb_slope,
-    encode_radiance,
-    encode_srgb_slope,
-    encode_srgb_unclipped,
-)
+from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
 SPECULAR = -3.0  #: logit of the specular reflectances at the start: 0.05
@@ -146,26 +137,6 @@ def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, 
         seen *= dr.gather(ad.Float, visibility[0], k)
     logits = [dr.gather(ad.Float, scatterers.features, (scatterers.albedos + i) * gaussians + k) for i in range(3)]
     return [seen * sigmoid(logit) for logit in logits]
-
-
-def field_color(encoding: str | None, output: Float) -> Float:
-    """A channel [M] of what the field's network gives: its sigmoid. Linear colours are encoded as such, see
-    `LightConfig.encoding`: loss and eye tell dark ones apart by ratios, for which a sigmoid is too flat."""
-    value = sigmoid(output)
-    if encoding is None:
-        return value
-    return decode_radiance(ENCODED_PEAK * value) if encoding == "radiance" else decode_srgb(value)
-
-
-def field_color_slope(encoding: str | None, color: Float) -> Float:
-    """d `field_color` by the output, of what it gives."""
-    if encoding is None:
-        return color * (1 - color)
-    if encoding == "radiance":
-        value = encode_radiance(color)
-        return value * (1 - value / ENCODED_PEAK) * decode_radiance_slope(value)
-    value = encode_srgb_unclipped(color)
-    return value * (1 - value) * decode_srgb_slope(value)
 
 
 def add_irradiance(color: Float, light: Float, linear: bool) -> Float:

@@ -1,12 +1,11 @@
 """How light becomes colour: the configuration of a relightable model."""
 
-from dataclasses import dataclass
-from dataclasses import field as with_default
+import dataclasses
 
 from spacesim.data.errors import InputError
 from spacesim.data.images.tone import PEAK, STANDARD_EXPOSURE, WHITES, Curve, Tone
 from spacesim.data.structure import check_fields
-from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.field import Decoding, FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 
@@ -14,11 +13,11 @@ MAX_EMITTERS = 2**14  #: of one bounce; `Surroundings.seen` numbers their sides 
 MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class LightConfig:
     """How light becomes colour."""
 
-    field: FieldConfig = with_default(default_factory=FieldConfig)  #: the network that gives colours
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)  #: the network that gives colours
     shadow: ShadowConfig | None = None  #: how shadows are cast; none leaves them to the field (the method `relight`)
     #: so many of the Gaussians, each for those around it, scatter sunlight once onto all that see them; 0 for none
     bounce: int = 0
@@ -38,8 +37,8 @@ class LightConfig:
     #: learn from radiance (gt/*.exr), not from 8-bit pictures, by sRGB values that go on beyond white as logarithms:
     #: colours reach 16 times white
     radiance: bool = False
-    #: the field gives linear colours encoded (`bounce.field_color`); older runs did not
-    encoded: bool = with_default(default=True, metadata={"option": False})
+    #: the field gives linear colours encoded, see `field_color`; older runs did not
+    encoded: bool = dataclasses.field(default=True, metadata={"option": False})
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -70,9 +69,8 @@ class LightConfig:
         return Curve(tone, self.exposure or 0.0, PEAK if self.radiance else WHITES[tone]) if self.linear else None
 
     @property
-    def encoding(self) -> str | None:
-        """How the field gives colours: linear ones as "srgb" values or, up to PEAK, by `encode_radiance` ("radiance");
-        None where as they are."""
+    def decoding(self) -> Decoding | None:
+        """Of linear colours, from what the field gives; None where they are what it gives."""
         return ("radiance" if self.radiance else "srgb") if self.linear and self.encoded else None
 
     @property

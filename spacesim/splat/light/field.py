@@ -1,7 +1,7 @@
 """The appearance field: colour of each Gaussian by its features, the Sun and the view (thesis 4.1, 4.2, table 4.1)."""
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import drjit as dr
 
@@ -9,13 +9,25 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_fields
-from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape
+from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
 from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.surface import shortest_axis
+from spacesim.splat.raster.tone import (
+    ENCODED_PEAK,
+    decode_radiance,
+    decode_radiance_slope,
+    decode_srgb,
+    decode_srgb_slope,
+    encode_radiance,
+    encode_srgb_unclipped,
+)
+
+Decoding = Literal["srgb", "radiance"]
+"""How linear colours are decoded from what the field's network gives: as sRGB values, or by `decode_radiance`."""
 
 TURNED = 0.15  #: a surface with n . s of at most -TURNED is turned away from the Sun
 
@@ -214,3 +226,23 @@ def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Float:
 def _normals(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Array3f:
     """Array3f [3, M], of any length."""
     return ad.Array3f(batch.block(inputs.features, config.features, 3))
+
+
+def field_color(decoding: Decoding | None, output: Float) -> Float:
+    """A channel [M] of a colour of what the field's network gives: its sigmoid, decoded where that is asked for. Loss
+    and eye tell dark colours apart by ratios, for which a sigmoid is too flat."""
+    value = sigmoid(output)
+    if decoding is None:
+        return value
+    return decode_radiance(ENCODED_PEAK * value) if decoding == "radiance" else decode_srgb(value)
+
+
+def field_color_slope(decoding: Decoding | None, color: Float) -> Float:
+    """d `field_color` by the output, of what it gives."""
+    if decoding is None:
+        return color * (1 - color)
+    if decoding == "radiance":
+        value = encode_radiance(color)
+        return value * (1 - value / ENCODED_PEAK) * decode_radiance_slope(value)
+    value = dr.select(color < 1, encode_srgb_unclipped(color), 1)  # which rounding leaves short of 1
+    return value * (1 - value) * decode_srgb_slope(value)

@@ -19,8 +19,6 @@ from spacesim.splat.light.bounce import (
     add_irradiance_slopes,
     albedo_radiance,
     emission,
-    field_color,
-    field_color_slope,
     gathered,
     grazing_reflectance,
     grazing_reflectance_slope,
@@ -33,6 +31,8 @@ from spacesim.splat.light.field import (
     FieldConfig,
     FieldInputs,
     earthlight,
+    field_color,
+    field_color_slope,
     field_items,
     field_views,
     is_back_side_seen,
@@ -93,7 +93,7 @@ def shade(
     views = field_views(config.field, field_inputs, batch)
     items = field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, inputs.sun.field_encoding)
-    colors = [field_color(config.encoding, batch.row(output, i)) for i in range(3)]
+    colors = [field_color(config.decoding, batch.row(output, i)) for i in range(3)]
     occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
@@ -128,7 +128,7 @@ def shade_picture(
     else:
         rows = batch.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
-    colors = [field_color(config.encoding, value) for value in outputs]
+    colors = [field_color(config.decoding, value) for value in outputs]
     faces = sun_facing(field, field_inputs, views, batch)
     visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
     shown = _dimmed(inputs.sun, colors, visibility, faces)
@@ -222,7 +222,7 @@ def adjoint(
         )
     gradients = [gradient * slope for gradient, slope in zip(gradients, slopes, strict=True)]
     pairs = list(zip(gradients, tape.colors, strict=True))
-    grad_output = batch.matrix([g * visibility * field_color_slope(config.encoding, c) for g, c in pairs])
+    grad_output = batch.matrix([g * visibility * field_color_slope(config.decoding, c) for g, c in pairs])
     grad_weights, grad_items = mlp.backward(
         config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output
     )
@@ -355,7 +355,7 @@ def _painted(
     rows = [dr.gather(ad.Float, inputs.features, i * gaussians + number) for i in range(field.features)]
     rows += [*field.view(direction), *surface_cosines(normals, direction, towards_sun(inputs.sun.light_axes))]
     output, _ = mlp.forward(field.shape, weights, columns.matrix(rows, field.shape.rows), inputs.sun.field_encoding)
-    colors = [field_color(config.encoding, columns.row(output, i)) for i in range(3)]
+    colors = [field_color(config.decoding, columns.row(output, i)) for i in range(3)]
     for share in visibility:
         colors = [color * dr.gather(ad.Float, share, number) for color in colors]
     light = colors if config.linear else [decode_srgb(color) for color in colors]

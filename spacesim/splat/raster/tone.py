@@ -49,23 +49,26 @@ def adjust_exposure(light: np.ndarray, tone: str, stops: float = 0.0, white: flo
 
 
 def encode_radiance(light: ArrayT) -> ArrayT:
-    """What is compared of colours that are shares of PEAK, 0 or more: sRGB values up to white, beyond it logarithms
-    that go on with the slope there, ENCODED_PEAK at PEAK. Arrays of any shape."""
+    """Numbers by which a model that learns radiance is compared with it, of colours that are shares of PEAK, 0 or more:
+    sRGB values up to white, beyond it logarithms that go on with the slope there, ENCODED_PEAK at PEAK. Arrays of any
+    shape."""
     v = PEAK * light
-    beyond = dr.fma(_SLOPE_AT_WHITE, dr.log(dr.maximum(v, 1)), 1)
-    return cast(ArrayT, dr.select(v < 1, encode_srgb_unclipped(dr.minimum(v, 1)), beyond))
+    below = v <= 1
+    beyond: ArrayT = _SLOPE_AT_WHITE * dr.log(dr.select(below, 1 + 0 * v, v)) + 1
+    values: ArrayT = encode_srgb_unclipped(dr.select(below, v, 0 * v))
+    return dr.select(below, values, beyond)
 
 
 def decode_radiance(values: ArrayT) -> ArrayT:
     """The inverse: colours, shares of PEAK. Arrays of any shape."""
     beyond = dr.exp((dr.maximum(values, 1) - 1) / _SLOPE_AT_WHITE)
-    return cast(ArrayT, dr.select(values < 1, decode_srgb(dr.minimum(values, 1)), beyond) / PEAK)
+    return dr.select(values <= 1, decode_srgb(dr.minimum(values, 1)), beyond) / PEAK
 
 
 def decode_radiance_slope(values: ArrayT) -> ArrayT:
     """d `decode_radiance`. Arrays of any shape."""
     beyond = dr.exp((dr.maximum(values, 1) - 1) / _SLOPE_AT_WHITE) / _SLOPE_AT_WHITE
-    return cast(ArrayT, dr.select(values < 1, decode_srgb_slope(dr.minimum(values, 1)), beyond) / PEAK)
+    return dr.select(values <= 1, decode_srgb_slope(dr.minimum(values, 1)), beyond) / PEAK
 
 
 def encode_srgb(linear: ArrayT) -> ArrayT:

@@ -23,6 +23,21 @@ def in_this_layout(values: JsonMapping) -> JsonDict:
     return values
 
 
+def not_trained_any_more(values: JsonMapping) -> str:
+    """What the training of a run with this config.json did that it does no longer, so that it cannot go on; "" where
+    nothing."""
+    light = values.get("light")
+    light = light if isinstance(light, Mapping) else {}
+    shadow = light.get("shadow")
+    shadow = shadow if isinstance(shadow, Mapping) else {}
+    method = shadow.get("method")
+    if light.get("radiance") is True and "encoded" not in light:
+        return "compares radiance by the mu-law"
+    if shadow.get("gradients") is True or (isinstance(method, Mapping) and method.get("gradients") is True):
+        return "moves Gaussians through their shadows"
+    return ""
+
+
 def _light(light: JsonDict) -> JsonDict:
     field, shadow = light.get("field"), light.get("shadow")
     if light.get("linear") is True:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import write_json
+from spacesim.data.files import read_json, write_json
 from spacesim.data.images.tone import tone_and_exposure
 from spacesim.data.records import Dataset
 from spacesim.data.store import write_points
@@ -18,6 +18,7 @@ from spacesim.learning.folder import TrainingProgress, check_folder, describe_da
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.old_config import not_trained_any_more
 from spacesim.splat.train.pictures.poses import pose_config, pose_warning
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
 from spacesim.splat.train.start import distance_warning, scale_warning, sun_warning
@@ -44,6 +45,8 @@ def train(
     described = {**config.to_json(), "data": describe_data(dataset)}
     if is_finished(out, described, resume, read_config):
         return load_run(out)
+    if resume and (begun := out / "config.json").exists() and (what := not_trained_any_more(read_json(begun))):
+        raise InputError(f"{out}: expected a run that this version has begun, found one that {what}; train it anew")
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)
     if config.sun == "given" and not config.refine_poses:

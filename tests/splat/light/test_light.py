@@ -426,7 +426,7 @@ def test_a_sun_that_stays_is_asked_for_once():
 def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors):
     monkeypatch.setattr(light_module, "COOPERATIVE", ("cuda", "llvm") if by_vectors else ())
     light, tolerance = model(name), 2e-3 if by_vectors else 1e-5
-    if light.config.encoding:  # what the network is off, times the slope of what decodes it
+    if light.config.decoding:  # what the network is off, times the slope of what decodes it
         tolerance *= 2.4
     splats = gaussians(700, light.config.features)
     other_eye = Pinhole.of(Camera(look_at([5, 2, 1], [0, 0, 0]), 32, 32, 40, 40, 16, 16))

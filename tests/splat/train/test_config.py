@@ -124,6 +124,25 @@ def test_the_thesis_has_the_light_of_its_text(method):
     assert (ours.crop, ours.between, ours.refine.residual) == (True, "others", True)
 
 
+@pytest.mark.parametrize(("changed", "said"), [("radiance", "by the mu-law"), ("gradients", "through their shadows")])
+def test_what_training_does_no_longer_is_not_resumed(small_lit_dataset, tmp_path, changed, said):
+    config = with_settings(preset("demo", "shadow-splat"), {"iterations": 2, "init_count": 40, "light.shadow.size": 16})
+    if changed == "radiance":
+        config = with_settings(config, {"light.linear": True, "light.radiance": True})
+    train(small_lit_dataset, tmp_path / "run", config)
+    (tmp_path / "run/model.safetensors").unlink()
+    values = json.loads((tmp_path / "run/config.json").read_text())
+    if changed == "radiance":
+        del values["light"]["encoded"]
+        config = replace(config, light=replace(config.light, encoded=False))
+    else:
+        values["light"]["shadow"]["method"]["gradients"] = True
+    (tmp_path / "run/config.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=f"run: expected a run that this version has begun, .*{said}; train it anew"):
+        train(small_lit_dataset, tmp_path / "run", config, resume=True)
+    assert json.loads((tmp_path / "run/config.json").read_text()) == values
+
+
 def test_an_older_run_is_resumed(small_lit_dataset, tmp_path):
     config = replace(as_it_was(preset("demo", "shadow-map", "mesh-aware")), iterations=2, init_count=40)
     run = train(small_lit_dataset, tmp_path / "run", config)

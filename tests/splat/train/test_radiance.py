@@ -52,7 +52,7 @@ def config(**options) -> TrainConfig:
 
 
 def test_what_is_compared_equals_its_formula_and_slopes_central_differences():
-    shares = np.concatenate([[0, 1e-5, 1e-3], np.linspace(0.01, 1, 40), [3, 50, 1e4]])  # beyond the peak, too
+    shares = np.concatenate([[0, 1e-5, 1e-3, 1 / PEAK], np.linspace(0.01, 1, 40), [3, 50, 1e4]])  # beyond the peak, too
     light = upload(shares)
     dr.enable_grad(light)
     found = tone.encode_radiance(light)

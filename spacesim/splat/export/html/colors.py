@@ -22,7 +22,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at, normalize
 from spacesim.learning import mlp
 from spacesim.learning.reflectance import LOBES
 from spacesim.splat.export.html.sunlight import octahedral_directions, quantized
-from spacesim.splat.light.bounce import field_color
+from spacesim.splat.light.field import field_color
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading import first_layer_of_features, split_weights
@@ -126,7 +126,7 @@ class _Cosines:
         items = batch.matrix(rows, mlp.round_up_rows(len(rows)))
         shared = self.light.encode_sun(None).field_encoding
         output, _ = mlp.forward(field.shape, self.weights, items, shared, self.first_layer)
-        colors = [field_color(self.light.config.encoding, batch.row(output, channel)) for channel in range(3)]
+        colors = [field_color(self.light.config.decoding, batch.row(output, channel)) for channel in range(3)]
         dr.eval(colors)
         return np.stack([np.array(color)[: self.gaussians.count] for color in colors], axis=1)
 

@@ -85,6 +85,7 @@ def runs() -> dict[str, Run]:
         "relit": lit_run("relit", shadows),
         "earthlit": lit_run("earthlit", replace(shadows, shadow=None, bounce=0, earth=True)),
         "linear": lit_run("linear", linear, -3.0),
+        "radiance": lit_run("radiance", replace(shadows, shadow=None, bounce=0, linear=True, radiance=True)),
         "directions": lit_run("directions", LightConfig(FieldConfig(**small, inputs=DirectionsConfig()))),
     }
 
