@@ -54,9 +54,9 @@ def encode_radiance(light: ArrayT) -> ArrayT:
     shape."""
     v = PEAK * light
     below = v <= 1
-    beyond: ArrayT = _SLOPE_AT_WHITE * dr.log(dr.select(below, 1 + 0 * v, v)) + 1
-    values: ArrayT = encode_srgb_unclipped(dr.select(below, v, 0 * v))
-    return dr.select(below, values, beyond)
+    beyond: ArrayT = _SLOPE_AT_WHITE * dr.log(dr.maximum(v, 1)) + 1
+    inside: ArrayT = dr.select(below, v, dr.minimum(v, 1))  # at white the gradient is v's
+    return dr.select(below, encode_srgb_unclipped(inside), beyond)
 
 
 def decode_radiance(values: ArrayT) -> ArrayT:

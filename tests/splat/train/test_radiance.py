@@ -2,6 +2,7 @@
 white."""
 
 import json
+import math
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -64,6 +65,10 @@ def test_what_is_compared_equals_its_formula_and_slopes_central_differences():
     np.testing.assert_allclose(np.array(dr.grad(light))[1:], slopes[1:], rtol=1e-4)
     assert np.array(dr.grad(light))[0] == pytest.approx(12.92 * PEAK)
     assert encoded(1) == pytest.approx(tone.ENCODED_PEAK)
+    endless = upload([math.inf])
+    dr.enable_grad(endless)
+    dr.backward(tone.encode_radiance(endless))
+    assert np.array(dr.grad(endless))[0] == 0
     np.testing.assert_allclose(np.array(tone.decode_radiance(upload(values))), shares, rtol=2e-5)
     slopes = np.array(tone.decode_radiance_slope(upload(values)))
     np.testing.assert_allclose(slopes[1:] * np.array(dr.grad(light))[1:], 1, rtol=1e-4)
