@@ -14,7 +14,14 @@ from spacesim.data.records import Dataset
 from spacesim.data.store import write_points
 from spacesim.data.transforms import check_still
 from spacesim.learning.cameras import farthest_camera, focus_point
-from spacesim.learning.folder import TrainingProgress, check_folder, describe_data, is_finished, open_folder
+from spacesim.learning.folder import (
+    TrainingProgress,
+    check_folder,
+    describe_data,
+    holds_training,
+    is_finished,
+    open_folder,
+)
 from spacesim.splat.run import Run, load_run, read_config
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
@@ -45,7 +52,7 @@ def train(
     described = {**config.to_json(), "data": describe_data(dataset)}
     if is_finished(out, described, resume, read_config):
         return load_run(out)
-    if resume and (begun := out / "config.json").exists() and (what := not_trained_any_more(read_json(begun))):
+    if holds_training(out) and (what := not_trained_any_more(read_json(out / "config.json"))):
         raise InputError(f"{out}: expected a run that this version has begun, found one that {what}; train it anew")
     if config.warm_start is not None and (remark := config.warm_start.remark(config.iterations)):
         log.warning(remark)

@@ -126,7 +126,8 @@ def test_the_thesis_has_the_light_of_its_text(method):
 
 @pytest.mark.parametrize(("changed", "said"), [("radiance", "by the mu-law"), ("gradients", "through their shadows")])
 def test_what_training_does_no_longer_is_not_resumed(small_lit_dataset, tmp_path, changed, said):
-    config = with_settings(preset("demo", "shadow-splat"), {"iterations": 2, "init_count": 40, "light.shadow.size": 16})
+    small = {"iterations": 2, "checkpoint_every": 1, "init_count": 40, "light.shadow.size": 16}
+    config = with_settings(preset("demo", "shadow-splat"), small)
     if changed == "radiance":
         config = with_settings(config, {"light.linear": True, "light.radiance": True})
     train(small_lit_dataset, tmp_path / "run", config)
