@@ -97,7 +97,7 @@ def by_tiles(
         a, b, c = record[2], record[3], record[4]
         powers = exponents(record, thread.x, thread.y, shape)
         transmittance, behind = list(transmittance), list(behind)
-        moments = PixelMoments(dx, dy)
+        moments = _PixelMoments(dx, dy)
         absolute_x, absolute_y = ad.Float(0), ad.Float(0)
         grad_features = [ad.Float(0) for _ in range(channels)]
         for p, (i, j) in enumerate(offsets):
@@ -121,17 +121,17 @@ def by_tiles(
                 absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
         sums = moments.sums()
         sums += [absolute_x, absolute_y, *grad_features] if absolute else grad_features
-        add_to_slots(slots, sums, lists.sum_index(k), mode)
+        _add_to_slots(slots, sums, lists.sum_index(k), mode)
         return k, transmittance, behind
 
     tile_last = dr.block_reduce(dr.ReduceOp.Max, state.last, shape.threads * shape.pixels)
     first = dr.gather(ad.UInt32, tile_last, thread.tile)
     dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
     dr.eval(slots)
-    return gather_slots(slots, splats, lists, channels, absolute)
+    return _gather_slots(slots, splats, lists, channels, absolute)
 
 
-class PixelMoments:
+class _PixelMoments:
     """Sums over a thread's pixels, column by column, of g, g dx, g dy, g dx^2, g dx dy and g dy^2; (dx, dy): from the
     splat's centre to the pixel. dx, dy: of the thread's first pixel"""
 
@@ -158,7 +158,7 @@ class PixelMoments:
         return total
 
 
-def add_to_slots(slots: list[Float], sums: list[Float], slot: UInt32, mode: dr.ReduceMode) -> None:
+def _add_to_slots(slots: list[Float], sums: list[Float], slot: UInt32, mode: dr.ReduceMode) -> None:
     """Add a thread's sums to its pair's slot in each array. All threads do: to ask each whether it has anything to add
     costs more, on a CPU and on CUDA."""
     for target, values in zip(slots, packets(sums), strict=True):
@@ -248,7 +248,7 @@ def by_buckets(
             value = ad.Array4f(values[4 * j : 4 * j + 4])
             dr.scatter(slots, value, slot * fours + j, listed, dr.ReduceMode.NoConflicts)
     dr.eval(slots)
-    return gather_slots([slots], splats, lists, channels, absolute)
+    return _gather_slots([slots], splats, lists, channels, absolute)
 
 
 def _add_pixel(
@@ -339,7 +339,9 @@ def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
-def gather_slots(slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool) -> SplatGradients:
+def _gather_slots(
+    slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool
+) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
 
     slots: arrays [F P], F of a pair's sums side by side in each
