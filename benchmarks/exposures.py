@@ -15,23 +15,21 @@ and deviations. What is done already is not done again.
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support import common
+from support import common, seeds
 
 from spacesim import backend
 from spacesim.data.files import read_json, write_json
 from spacesim.data.images import write_png
 from spacesim.data.records import Dataset
 from spacesim.data.store import load_truth, read_dataset
-from spacesim.eval.evaluate import EvaluateConfig
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.lights.sun import EXPOSURE
-from spacesim.splat.train.config import METHODS, preset, with_options, with_settings
+from spacesim.splat.train.config import METHODS, with_settings
 
 LINEAR, FITTED = {"light.linear": True}, {"exposure_per_picture": True}
 RADIANCE = {**LINEAR, "light.radiance": True}
@@ -62,22 +60,11 @@ STOPS = 1.0  #: EV, the most by which varied exposures differ from the first
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
-    parser.add_argument("--suns", type=common.positive, default=16, help="of training (16)")
-    parser.add_argument("--views", type=common.positive, default=40, help="under each of them (40)")
-    parser.add_argument("--resolution", type=common.positive, default=256, metavar="PX", help="of the pictures (256)")
-    parser.add_argument("--samples", type=common.positive, default=1024, metavar="N", help="of test pictures (1024)")
-    parser.add_argument("--method", choices=METHODS[1:], default="shadow-splat")
-    parser.add_argument("--preset", default="fast")
-    parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
-    parser.add_argument("--seeds", type=common.positive, default=1, help="trainings a row (1)")
+    parser = seeds.arguments(__doc__, METHODS[1:])
+    seeds.add_rig(parser)
     parser.add_argument("--rows", default=",".join(ROWS), help=f"of {', '.join(map(repr, ROWS))} (all)")
     options = parser.parse_args()
-    names = common.row_names(options.rows)
-    unknown = [name for name in names if name not in ROWS]
-    if unknown:
-        parser.error(f"--rows: expected some of {', '.join(ROWS)}, found {unknown[0]!r}")
+    names = seeds.chosen(parser, "--rows", options.rows, ROWS)
     backend.select(options.backend)
     rows = list(rows_of(names, options))
     common.emit({"rows": rows}, {f"{options.method}, {options.preset}": rows}, options)
@@ -85,23 +72,15 @@ def main() -> None:
 
 def rows_of(names: list[str], options: Any) -> Iterator[common.Row]:
     """A row for each name."""
-    config = with_options(preset(options.preset, options.method), iterations=options.iterations)
+    config = seeds.config_of(options)
     data: dict[str, Dataset] = {}
     for name in names:
         pictures, settings = ROWS[name]
         if pictures not in data:
             data[pictures] = pictures_of(pictures, options)
-        results = [
-            common.measured(
-                name,
-                replace(with_settings(config, settings), seed=seed),
-                EvaluateConfig(geometry=None),
-                data[pictures],
-                options.out / f"{name}-{seed}",
-            )
-            for seed in range(options.seeds)
-        ]
-        yield {"pictures, trained on": name, **common.means(results, COLUMNS)}
+        row = with_settings(config, settings)
+        results = seeds.trainings(name, row, data[pictures], options.out / name, options.seeds)
+        yield {"pictures, trained on": name, **seeds.means(results, COLUMNS)}
 
 
 def pictures_of(name: str, options: Any) -> Dataset:

@@ -15,33 +15,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from support import common, craft
+from support import common, craft, seeds
 
 from spacesim import backend
 from spacesim.data.store import read_dataset
-from spacesim.eval.evaluate import EvaluateConfig
-from spacesim.splat.train.config import METHODS, TrainConfig, preset, with_options
+from spacesim.splat.train.config import METHODS, TrainConfig
 
 CRAFT = "boxsat", "telescope", "upper-stage", "cubesat", *craft.NAMES
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
+    parser = seeds.arguments(__doc__, METHODS[2:])
+    seeds.add_rig(parser)
     parser.add_argument("--craft", default=",".join(CRAFT), help="commas between (all)")
-    parser.add_argument("--suns", type=common.positive, default=16, help="of training (16)")
-    parser.add_argument("--views", type=common.positive, default=40, help="under each of them (40)")
-    parser.add_argument("--resolution", type=common.positive, default=256, metavar="PX", help="of the pictures (256)")
-    parser.add_argument("--samples", type=common.positive, default=1024, metavar="N", help="of test pictures (1024)")
-    parser.add_argument("--method", choices=METHODS[2:], default="shadow-splat")
-    parser.add_argument("--preset", default="fast")
-    parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
-    parser.add_argument("--seeds", type=common.positive, default=1, help="trainings a row (1)")
     options = parser.parse_args()
-    names = common.row_names(options.craft)
-    unknown = [name for name in names if name not in CRAFT]
-    if unknown:
-        parser.error(f"--craft: expected some of {', '.join(CRAFT)}, found {unknown[0]!r}")
+    names = seeds.chosen(parser, "--craft", options.craft, CRAFT)
     backend.select(options.backend)
     rows = list(rows_of(names, options))
     common.emit({"rows": rows}, {f"{options.method}, {options.preset}": rows}, options)
@@ -54,9 +42,9 @@ def rows_of(names: list[str], options: Any) -> Iterator[common.Row]:
         folder = options.out / name
         path = craft.write(name, folder / "mesh") if name in craft.NAMES else alone(name, folder)
         data = read_dataset(common.generated(str(path), folder / "data", **scene, resolution=options.resolution))
-        config = with_options(preset(options.preset, options.method), iterations=options.iterations)
+        config = seeds.config_of(options)
         without, method = (
-            [trained(label, replace(row, seed=seed), data, folder) for seed in range(options.seeds)]
+            seeds.trainings(f"{name}, {label}", row, data, folder / label, options.seeds)
             for label, row in (("no shadows", without_shadows(config)), (options.method, config))
         )
         yield {"craft": name, **summary(without, method)}
@@ -74,11 +62,6 @@ def without_shadows(config: TrainConfig) -> TrainConfig:
     """`relight` with all that `config` has beside shadows."""
     assert config.light is not None
     return replace(config, light=replace(config.light, shadow=None))
-
-
-def trained(label: str, config: TrainConfig, data: Any, folder: Path) -> common.Row:
-    out = folder / f"{label}-{config.seed}"
-    return common.measured(f"{folder.name}, {label}", config, EvaluateConfig(geometry=None), data, out)
 
 
 def summary(without: list[common.Row], method: list[common.Row]) -> common.Row:

@@ -10,16 +10,14 @@ again.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from support import common
+import numpy as np
+from support import common, seeds
 
 from spacesim import backend
 from spacesim.data.store import read_dataset
-from spacesim.eval.evaluate import EvaluateConfig
-from spacesim.splat.train.config import METHODS, preset, with_options
+from spacesim.splat.train.config import METHODS
 
 SCENE = {"spp": 64, "test_views": 5}
 COLUMNS = {
@@ -27,21 +25,13 @@ COLUMNS = {
     "BER": ("shadow", "ber", "mean"),
     "mask error": ("shadow_mask", "error_rate", "mean"),
 }
-GAUSSIANS = {"Gaussians": ("model", "gaussians")}
 TEST_SUNS = 8
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
+    parser = seeds.arguments(__doc__, METHODS)
     parser.add_argument("--pictures", type=common.positive, default=640, help="for training, in each row (640)")
     parser.add_argument("--suns", default="4,16,64,320,640", help="of the rows, commas between (4,16,64,320,640)")
-    parser.add_argument("--resolution", type=common.positive, default=256, metavar="PX", help="of the pictures (256)")
-    parser.add_argument("--samples", type=common.positive, default=1024, metavar="N", help="of test pictures (1024)")
-    parser.add_argument("--method", choices=METHODS, default="shadow-splat")
-    parser.add_argument("--preset", default="fast")
-    parser.add_argument("--iterations", type=common.positive, help="default: the preset's")
-    parser.add_argument("--seeds", type=common.positive, default=1, help="trainings a row (1)")
     options = parser.parse_args()
     words = options.suns.split(",")
     counts = [int(word) if word.isdigit() else 0 for word in words]
@@ -57,29 +47,21 @@ def rows_of(counts: list[int], options: Any) -> Iterator[common.Row]:
     unseen = {"suns": 1, "views": 1, "test_suns": TEST_SUNS, **SCENE, "test_spp": options.samples}
     unseen["resolution"] = options.resolution
     truth = read_dataset(common.generated("boxsat", options.out / "unseen", **unseen))
-    config = with_options(preset(options.preset, options.method), iterations=options.iterations)
+    config = seeds.config_of(options)
     for count in counts:
         each = options.pictures // count
         scene = {"suns": count, "views": each, **SCENE, "test_views": 0, "resolution": options.resolution}
         data = read_dataset(common.generated("boxsat", options.out / f"data-{count}", **scene))
-        results = [
-            common.measured(
-                f"{count} Suns",
-                replace(config, seed=seed),
-                EvaluateConfig(geometry=None),
-                data,
-                options.out / f"{count}-{seed}",
-                truth,
-            )
-            for seed in range(options.seeds)
-        ]
+        results = seeds.trainings(f"{count} Suns", config, data, options.out / str(count), options.seeds, truth)
         yield {"Suns": count, "views of each": each, **summary(results)}
 
 
 def summary(results: list[common.Row]) -> common.Row:
     """Means over trainings, and how many Gaussians there are."""
-    cells = common.means(results, COLUMNS)
-    return cells if "note" in cells else cells | {"Gaussians": int(common.means(results, GAUSSIANS)["Gaussians"])}
+    cells = seeds.means(results, COLUMNS)
+    if "note" not in cells:
+        cells["Gaussians"] = int(np.mean([result["model"]["gaussians"] for result in results]))
+    return cells
 
 
 if __name__ == "__main__":

@@ -152,23 +152,6 @@ def number_in(metrics: Row, *names: str) -> float | None:
     return value
 
 
-def means(results: Sequence[Row], columns: Mapping[str, Sequence[str]]) -> Row:
-    """Of each column, by its heading, the mean of the `number_in` of all results, and their standard deviation where
-    there are several; {"note": why} where one has failed."""
-    notes = [result["note"] for result in results if "note" in result]
-    if notes:
-        return {"note": notes[0]}
-    cells: Row = {}
-    for heading, names in columns.items():
-        values = [value for value in (number_in(result, *names) for result in results) if value is not None]
-        if len(values) < len(results):
-            continue
-        cells[heading] = float(np.mean(values))
-        if len(values) > 1:
-            cells[f"{heading}, deviation"] = float(np.std(values, ddof=1))
-    return cells
-
-
 def standalone(drawn: str, names: Sequence[str]) -> str:
     """An SVG file's text of a `line_chart`: its own colours and letters, and the curves' names."""
     style = ".line{fill:none;stroke-width:2}.axis{stroke:#e2e3de}text{font:12px sans-serif;fill:#1b2027}"
