@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from spacesim.data.images import linear_from_srgb, load_image, read_exr, read_png, write_exr
-from spacesim.data.images.tone import STANDARD_EXPOSURE, Curve
+from spacesim.data.images.tone import MU, PEAK, STANDARD_EXPOSURE, Curve, mu_law
 from spacesim.eval.evaluate import evaluate
 from spacesim.eval.frame_metrics import own_exposure
 from spacesim.splat.run import Prediction
@@ -36,6 +36,14 @@ def decibels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> flo
     """From the definition, of linear display values [H, W, 3]."""
     encoded = [np.log(1 + 5000 * np.clip(v, 0, 16) / 16) / math.log(5001) for v in (prediction, truth)]
     return -10 * math.log10(((encoded[0] - encoded[1])[mask] ** 2).mean())
+
+
+def test_the_law_equals_its_formula():
+    shares = np.concatenate([[0, 1e-5, 1e-3], np.linspace(0.01, 1, 40), [3, 50, 1e4]])  # beyond the peak, too
+    formula = np.log(1 + 5000 * shares) / math.log(5001)
+    np.testing.assert_allclose(mu_law(PEAK * shares), formula, atol=1e-12)
+    assert (mu_law(np.zeros(1))[0], MU, PEAK) == (0, 5000, 16)
+    assert mu_law(np.full(1, PEAK))[0] == pytest.approx(1, abs=1e-12)
 
 
 def truth_of(dataset, frame) -> tuple[np.ndarray, np.ndarray]:

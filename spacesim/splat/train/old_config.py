@@ -1,6 +1,7 @@
 """config.json of runs that were trained with other fields: in today's layout."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from spacesim.data.files import JsonDict, JsonMapping
 
@@ -23,17 +24,15 @@ def in_this_layout(values: JsonMapping) -> JsonDict:
     return values
 
 
-def not_trained_any_more(values: JsonMapping) -> str:
-    """What the training of a run with this config.json did that it does no longer, so that it cannot go on; "" where
-    nothing."""
-    light = values.get("light")
-    light = light if isinstance(light, Mapping) else {}
-    shadow = light.get("shadow")
-    shadow = shadow if isinstance(shadow, Mapping) else {}
+def not_trained_any_more(values: dict[str, Any]) -> str:
+    """What the training of a run with this config.json, which can be read, did that it does no longer, so that it
+    cannot go on; "" where nothing."""
+    light = values.get("light") or {}
+    shadow = light.get("shadow") or {}
     method = shadow.get("method")
-    if light.get("radiance") is True and "encoded" not in light:
+    if light.get("radiance") and "encoded" not in light:
         return "compares radiance by the mu-law"
-    if shadow.get("gradients") is True or (isinstance(method, Mapping) and method.get("gradients") is True):
+    if shadow.get("gradients") or (isinstance(method, dict) and method.get("gradients")):
         return "moves Gaussians through their shadows"
     return ""
 

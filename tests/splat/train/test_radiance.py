@@ -62,8 +62,8 @@ def test_what_is_compared_equals_its_formula_and_slopes_central_differences():
     dr.backward(dr.sum(found))
     step = 1e-6 * np.maximum(shares, 1e-3)
     slopes = (encoded(shares + step) - encoded(shares - step)) / (2 * step)
-    np.testing.assert_allclose(np.array(dr.grad(light))[1:], slopes[1:], rtol=1e-4)
-    assert np.array(dr.grad(light))[0] == pytest.approx(12.92 * PEAK)
+    np.testing.assert_allclose(np.array(dr.grad(light)), slopes, rtol=1e-4)
+    assert slopes.min() > 0
     assert encoded(1) == pytest.approx(tone.ENCODED_PEAK)
     endless = upload([math.inf])
     dr.enable_grad(endless)
@@ -71,7 +71,7 @@ def test_what_is_compared_equals_its_formula_and_slopes_central_differences():
     assert np.array(dr.grad(endless))[0] == 0
     np.testing.assert_allclose(np.array(tone.decode_radiance(upload(values))), shares, rtol=2e-5)
     slopes = np.array(tone.decode_radiance_slope(upload(values)))
-    np.testing.assert_allclose(slopes[1:] * np.array(dr.grad(light))[1:], 1, rtol=1e-4)
+    np.testing.assert_allclose(slopes * np.array(dr.grad(light)), 1, rtol=1e-4)
 
 
 @pytest.mark.parametrize("curve", TONES)
