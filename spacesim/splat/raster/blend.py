@@ -6,6 +6,7 @@ CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel befor
 costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/research/speed.md).
 """
 
+from collections.abc import Callable
 from functools import reduce
 from typing import cast
 
@@ -34,6 +35,9 @@ from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lis
 BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
 CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
+
+Finish = Callable[[Float, list[Float]], list[Float]]
+"""(what passes, sums) of a pixel to the values of its planes."""
 
 
 def forward(
@@ -67,7 +71,24 @@ def blend_lists(
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
     adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
-    shape, channels = lists.shape, len(features)
+    (transmittance, *sums), kept = blend_planes(
+        splats, features, lists, (width, height), capacity, lambda passed, sums: [passed, *sums], bucket, packed
+    )
+    return BlendResult(sums, transmittance, kept)
+
+
+def blend_planes(
+    splats: Splats,
+    features: list[Float],
+    lists: TileLists,
+    image_size: tuple[int, int],
+    capacity: int,
+    finish: Finish,
+    bucket: int | None = None,
+    packed: list[Float] | None = None,
+) -> tuple[list[Float], BlendState | None]:
+    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`."""
+    (width, height), shape, channels = image_size, lists.shape, len(features)
     assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
     records = list_records(splats, features, lists, capacity, packed)
     walks = whole_lists(lists, channels)
@@ -76,13 +97,16 @@ def blend_lists(
     snapshots = _Checkpoints(lists, bucket, channels, walks) if bucket else None
     transmittance, sums, last = _walk(lists, records, walks, snapshots)
     transmittance, thread = [dr.abs(value) for value in transmittance], walks.thread
-    planes = [dr.empty(ad.Float, width * height) for _ in range(1 + channels)]
+    finished = [finish(passed, added) for passed, added in zip(transmittance, sums, strict=True)]
+    planes = [dr.empty(ad.Float, width * height) for _ in finished[0]]
     if cut:  # where a list is empty, nobody writes
-        planes = [dr.full(ad.Float, float(c == 0), width * height) for c in range(1 + channels)]
+        nothing = finish(ad.Float(1), [ad.Float(0)] * channels)
+        planes = [value + dr.zeros(ad.Float, width * height) for value in nothing]
+        dr.eval(planes)
     for p, (i, j) in enumerate(thread_offsets(shape)):
         column, row = thread.column + i, thread.row + j
         inside = walks.writes[p] & (column < width) & (row < height)
-        for plane, value in zip(planes, [transmittance[p], *sums[p]], strict=True):
+        for plane, value in zip(planes, finished[p], strict=True):
             dr.scatter(plane, value, row * width + column, inside, dr.ReduceMode.NoConflicts)
     kept = None
     if bucket is not None:
@@ -96,7 +120,7 @@ def blend_lists(
             bucket_reached=snapshots.reached if snapshots else None,
         )
     dr.eval(planes, kept)
-    return BlendResult(planes[1:], planes[0], kept)
+    return planes, kept
 
 
 def _walk(

@@ -11,7 +11,7 @@ import drjit as dr
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
 from spacesim.data.structure import checked
-from spacesim.splat.raster.blend import blend_lists, rasterize
+from spacesim.splat.raster.blend import blend_planes, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
 from spacesim.splat.raster.lists.bin import Boxes, Grid, bin_splats, list_capacity, make_boxes, make_lists
@@ -162,8 +162,13 @@ def _draw_boxes(
     """(the lists, of `capacity`, if they are wanted; planes)."""
     splats, groups = prepared.splats, prepared.groups
     lists = make_lists(splats, prepared.footprints, prepared.boxes, capacity, splat_capacity, grid)
-    blended = blend_lists(splats, _features(groups), lists, *size, splat_capacity, packed=prepared.records)
-    return lists if keeps_lists else None, _finish(blended.features, blended.transmittance, groups)
+
+    def finish(transmittance: Float, sums: list[Float]) -> list[Float]:
+        return _features(_finish(sums, transmittance, groups))
+
+    features = _features(groups)
+    planes, _ = blend_planes(splats, features, lists, size, splat_capacity, finish, packed=prepared.records)
+    return lists if keeps_lists else None, _by_name(planes[:-1], groups) | {"alpha": planes[-1:]}
 
 
 def _features(groups: Planes) -> list[Float]:
@@ -199,10 +204,15 @@ def _whole_features(features: list[Float], count: int) -> list[Float]:
     return [feature if dr.width(feature) == count else feature + dr.zeros(ad.Float, count) for feature in features]
 
 
-def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:
-    """Planes of what was blended by its names, with "alpha", expected depth and unit normals."""
+def _by_name(planes: list[Float], groups: Planes) -> Planes:
+    """Planes, one after another, by the names of what was blended."""
     rest = iter(planes)
-    finished = {name: [next(rest) for _ in group] for name, group in groups.items()}
+    return {name: [next(rest) for _ in group] for name, group in groups.items()}
+
+
+def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:
+    """Planes of what was blended by its names, with expected depth, unit normals and, last, "alpha"."""
+    finished = _by_name(planes, groups)
     finished["alpha"] = [1 - transmittance]
     if "depth" in finished:
         finished["depth"] = [over_alpha(finished["depth"][0], finished["alpha"][0])]

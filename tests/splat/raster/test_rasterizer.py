@@ -431,14 +431,16 @@ def test_absolute_sums_change_no_gradient(monkeypatch):
 
 def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
     buckets = []
-    plain = rasterize.blend_lists
 
-    def spied(*arguments, **named):
-        buckets.append(arguments[6] if len(arguments) > 6 else None)
-        return plain(*arguments, **named)
+    def spied(plain):
+        def call(*arguments, **named):
+            buckets.append(arguments[6] if len(arguments) > 6 else None)
+            return plain(*arguments, **named)
 
-    for module in (rasterize, rendering):
-        monkeypatch.setattr(module, "blend_lists", spied)
+        return call
+
+    for module, name in ((rasterize, "blend_lists"), (rendering, "blend_planes")):
+        monkeypatch.setattr(module, name, spied(getattr(module, name)))
     monkeypatch.setattr(rendering, "_draw_boxes", getattr(rendering._draw_boxes, "traced", rendering._draw_boxes))
     monkeypatch.setattr(rendering, "expected_capacity", lambda _: None)
     arrays, view = random_splats(30), camera()
