@@ -217,27 +217,36 @@ def by_buckets(
     records = [_record(state, buckets, i, lists) for i in range(bucket)]
     until = dr.select(buckets.reached, ad.UInt32(pixels), ad.UInt32(0))
 
-    def has_more(q: UInt32, _sums: object) -> Bool:
+    def read(q: UInt32) -> tuple[list[Float], list[Float], UInt32]:
+        """Of a pixel: its `_pixel_packets`, its state before the bucket, one past the last pair that it blends."""
+        exists, place = q < until, buckets.tile * pixels + q
+        looked = load(looks, place, tiles * pixels, exists)
+        kept = load(state.checkpoints, number * pixels + q, bucket_count * pixels, exists)
+        return looked[: 1 + channels], kept[: 1 + channels], dr.gather(ad.UInt32, state.last, place, exists)
+
+    def has_more(q: UInt32, _pixel: object, _sums: object) -> Bool:
         return q < until
 
-    def visit(q: UInt32, sums: list[list[Float]]) -> tuple[UInt32, list[list[Float]]]:
+    def visit(
+        q: UInt32, pixel: tuple[list[Float], list[Float], UInt32], sums: list[list[Float]]
+    ) -> tuple[UInt32, tuple[list[Float], list[Float], UInt32], list[list[Float]]]:
+        following = read(q + 1)  # on its way while this one is added
         column, row = pixel_in_tile(q, shape)
         px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
-        total, *gradients = load(looks, buckets.tile * pixels + q, tiles * pixels)
-        transmittance, *shown = load(state.checkpoints, number * pixels + q, bucket_count * pixels)
-        last = dr.gather(ad.UInt32, state.last, buckets.tile * pixels + q)
-        gradients, behind = gradients[:channels], total
+        (total, *gradients), (transmittance, *shown), last = pixel
+        behind = total
         for gradient, feature in zip(gradients, shown, strict=False):
             behind = dr.fma(-gradient, feature, behind)
         sums = [list(of_pair) for of_pair in sums]
         for i, record in enumerate(records):
             blends = buckets.first + i < last
-            pixel = transmittance, behind
-            transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, pixel, blends, absolute)
-        return q + 1, sums
+            before = transmittance, behind
+            transmittance, behind = _add_pixel(sums[i], record, (px, py), gradients, before, blends, absolute)
+        return q + 1, following, sums
 
     zeros = [[ad.Float(0) for _ in range(_numbers(channels, absolute))] for _ in range(bucket)]
-    _, sums = dr.while_loop((ad.UInt32(0), zeros), has_more, visit, mode="symbolic", label="buckets")
+    first = ad.UInt32(0)
+    *_, sums = dr.while_loop((first, read(first), zeros), has_more, visit, mode="symbolic", label="buckets")
     fours = _fours(channels, absolute)
     slots = dr.empty(ad.Float, 4 * fours * lists.capacity)  # a pair's numbers side by side, of all that are listed
     for i in range(bucket):

@@ -14,7 +14,7 @@ from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import tiles
-from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids, segment_landmarks, segment_near
+from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 
 pytestmark = pytest.mark.threads
@@ -195,20 +195,6 @@ def test_segment_ids_of_slots(number, segments):
     ends = upload(np.cumsum(counts).astype(number.lower()), getattr(ad, number))
     found = np.array(segment_ids(ends, dr.arange(ad.UInt32, int(counts.sum()) + 2), segments))
     np.testing.assert_array_equal(found, [*np.repeat(np.arange(segments), counts), segments, segments])
-
-
-@pytest.mark.parametrize("number", ["UInt32", "UInt64"])
-@pytest.mark.parametrize("spare", [0, 1, 31, 500])
-@pytest.mark.parametrize("segments", [1, 5, 300, 1023])
-def test_landmarks_find_the_segments_of_slots(number, spare, segments):
-    """Many empty ones in a row, some that many landmarks fall into; slots of no segment give none that is not there."""
-    counts = np.random.default_rng(segments).choice([0, 0, 0, 1, 3, 5, 290], segments)
-    counts[segments // 2] = 2
-    ends = upload(np.cumsum(counts).astype(number.lower()), getattr(ad, number))
-    total, slots = int(counts.sum()), dr.arange(ad.UInt32, int(counts.sum()) + spare)
-    landmarks = segment_landmarks(ends, upload(counts.astype(np.uint32), ad.UInt32), total + spare, ad.Bool(True))
-    found = np.array(segment_near(ends, landmarks, slots, dr.opaque(ad.UInt32, total)))
-    np.testing.assert_array_equal(found, [*np.repeat(np.arange(segments), counts), *[0] * spare])
 
 
 def test_pairs_are_numbered_in_few_bits_where_they_fit(way):

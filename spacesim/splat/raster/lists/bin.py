@@ -20,7 +20,7 @@ from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber
 from spacesim.data.errors import WorkError
-from spacesim.splat.raster.lists.sort import ordered_lists, segment_landmarks, segment_near
+from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
 from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity, tile_shape
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
 
@@ -270,7 +270,8 @@ def _count(
     """Lists that are ordered one by one."""
     slot, ends = dr.arange(ad.UInt32, capacity), boxes.pair_ends
     fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
-    splat = segment_near(ends, segment_landmarks(ends, boxes.count, capacity, fits), slot, total)
+    splat = segment_ids(ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity)  # beyond the last: its splat
+    splat = dr.minimum(splat, splat_capacity - 1)  # where there are no pairs
     before = ad.UInt32(dr.gather(type(ends), ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
     tile = _tile_of(splats, boxes, splat, slot - before, slot < total, grid)
     key = dr.gather(ad.UInt32, footprints.order, splat)

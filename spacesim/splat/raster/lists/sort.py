@@ -23,9 +23,10 @@ SIZES_OF_LONG = 64, 512, 4096, 32768, 262144  #: passes that take less where lis
 ROOM = 512  #: entries a list for which there is room, from which on lists may be long
 WAYS = 4  #: parts of what is left, of which a search takes one: fewer steps than by halves; 8 are slower
 COMPARED = 4  #: entries compared in a turn of the loop
-CLASSES = 64  #: of lengths of lists: those of a class count as equally long
+#: of lengths of lists: a block of threads waits for its longest walk; with neighbours of one class an H100 blends in
+#: three quarters of the time
+CLASSES = 64
 CLASSES_AN_OCTAVE = 6  #: so all lists of 1,500 entries and more are of one class
-STRIDE = 32  #: slots from one to the next whose segment is noted before all are searched: those of a warp
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond the longest run: as many as fill a large device
 
 
@@ -47,46 +48,6 @@ def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int
     return segment
 
 
-def segment_landmarks(segment_ends: UInt32 | UInt64, counts: UInt32, capacity: int, active: Bool) -> UInt32:
-    """Into which segment every `STRIDE`th of `capacity` slots falls, for `segment_near`; where all are in segments.
-
-    counts: slots of each segment;  active: whether slots are looked up at all
-    """
-    noted = dr.empty(ad.UInt32, capacity // STRIDE + 1)
-    segment, end = dr.arange(ad.UInt32, dr.width(counts)), ad.UInt32(segment_ends)
-
-    def has_more(slot: UInt32) -> Bool:
-        return slot < end
-
-    def note(slot: UInt32) -> tuple[UInt32]:
-        dr.scatter(noted, segment, slot // STRIDE)
-        return (slot + STRIDE,)
-
-    first = (end - counts + (STRIDE - 1)) & ~ad.UInt32(STRIDE - 1)
-    dr.while_loop((dr.select(active, first, end),), has_more, note, mode="symbolic", label="landmarks")
-    dr.eval(noted)
-    return noted
-
-
-def segment_near(segment_ends: UInt32 | UInt64, landmarks: UInt32, slot: UInt32, total: UInt32) -> UInt32:
-    """`segment_ids` of slots below `total`, by the landmarks before and behind; 0 of others."""
-    number, wide, exists = type(segment_ends), type(segment_ends)(slot), slot < total
-    before, last = slot // STRIDE, ad.UInt32(dr.width(segment_ends) - 1)
-    low = dr.gather(ad.UInt32, landmarks, before, exists)
-    noted = exists & ((before + 1) * STRIDE < total)
-    high = dr.select(noted, dr.gather(ad.UInt32, landmarks, before + 1, noted), dr.select(exists, last, low))
-
-    def has_more(low: UInt32, high: UInt32) -> Bool:
-        return low < high
-
-    def halve(low: UInt32, high: UInt32) -> tuple[UInt32, UInt32]:
-        middle = (low + high) // 2
-        reached = dr.gather(number, segment_ends, middle) <= wide
-        return dr.select(reached, middle + 1, low), dr.select(reached, high, middle)
-
-    return dr.while_loop((low, high), has_more, halve, mode="symbolic", label="segment")[0]
-
-
 def ordered_lists(
     members: UInt32,
     keys: UInt32,
@@ -96,9 +57,9 @@ def ordered_lists(
     sizes: tuple[int, ...] | None = None,
 ) -> tuple[UInt32, UInt32, UInt32, UInt32, UInt32]:
     """Entries [P] = [capacity] in lists, each ordered by key, then number: (number, entry) [P] one list after another,
-    where each list starts and ends, [lists], and all lists, the longest first, by classes of length. Entries whose list
-    is `lists` are in none; what stands behind the last list has no meaning. UInt32 all; no two entries of a list may
-    have one key and number. Not differentiable.
+    where each list starts and ends, [lists], and all lists by classes of length, the longest first, those of a class in
+    any order. Entries whose list is `lists` are in none; what stands behind the last list has no meaning. UInt32 all;
+    no two entries of a list may have one key and number. Not differentiable.
 
     sizes: of the runs that are made one from another, by default `SIZES`, `SIZES_OF_LONG` for lists that may be long
     """
