@@ -5,10 +5,10 @@
 
 The scene is a sphere of random splats that fills most of the picture, spherical harmonics of degree 3. Two times are
 given. "On the clock": synchronised calls from Python, tracing and launching included; median and quartiles after
-warm-up, ours and the peer's in turn. "Kernels": what the device alone needs, by Dr.Jit's kernel history and torch's
-profiler. "frame" is parameters to picture without gradients; forward and backward are blending and its adjoint.
-`--growth` measures 10,000 to 1,000,000 Gaussians and 128 to 2048 pixels, prints the slope of time against pairs of tile
-and splat, and draws it with `--plot`.
+warm-up, ours and the peer's in turn. "Kernels": what the device alone needs, by Dr.Jit's kernel history; beside a peer
+both by torch's profiler. "frame" is parameters to picture without gradients; forward and backward are blending and its
+adjoint. `--growth` measures 10,000 to 1,000,000 Gaussians and 128 to 2048 pixels, prints the slope of time against
+pairs of tile and splat, and draws it with `--plot`.
 """
 
 import argparse
@@ -120,13 +120,16 @@ def stages_of(frame: Any) -> dict[str, Any]:
 
 
 def add_peer_kernels(result: dict[str, Any], peers: Mapping[str, Any]) -> None:
-    """What the peers' kernels need for what `result` has measured on the clock, and the ratios of both."""
+    """What the peers' kernels and ours need for what `result` has measured on the clock, by one profiler, and the
+    ratios of both. Dr.Jit's own times, in `result`, have the events about each launch in them."""
     from support.peer_torch import device_milliseconds
 
+    inputs = common.sphere_arrays(result["gaussians"]), common.camera_from(DIRECTION, result["pixels"])
+    ours = Pipeline(*inputs)
     for name, peer in peers.items():
-        frame = peer.Frame(common.sphere_arrays(result["gaussians"]), common.camera_from(DIRECTION, result["pixels"]))
-        theirs = result["peers"][name]
-        theirs["kernels"] = {stage: device_milliseconds(work) for stage, work in stages_of(frame).items()}
+        theirs, works = result["peers"][name], stages_of(peer.Frame(*inputs))
+        theirs["kernels"] = {stage: device_milliseconds(work) for stage, work in works.items()}
+        theirs["our kernels"] = {stage: device_milliseconds(getattr(ours, stage)) for stage in works}
         theirs["ratios"] = ratios(result, theirs)
 
 
@@ -138,9 +141,10 @@ def ratios(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, float]:
             continue
         clocks = (sum(one["clock"][stage].median for stage in stages) for one in (ours, theirs))
         quotients[f"{name}, clock"] = next(clocks) / next(clocks)
-        if None not in theirs["kernels"].values():
-            kernels = (sum(one["kernels"][stage] for stage in stages) for one in (ours, theirs))
-            quotients[f"{name}, kernels"] = next(kernels) / next(kernels)
+        both = theirs["our kernels"], theirs["kernels"]
+        if all(None not in kernels.values() for kernels in both):
+            sums = (sum(kernels[stage] for stage in stages) for kernels in both)
+            quotients[f"{name}, kernels"] = next(sums) / next(sums)
     return quotients
 
 
@@ -162,9 +166,9 @@ def peer_row(result: dict[str, Any], name: str) -> common.Row:
     theirs = result["peers"][name]
     row: common.Row = {"Gaussians": result["gaussians"], "pixels": result["pixels"], "peer": name}
     row["frame"] = f"{result['clock']['frame']} / {theirs['clock']['frame']}"
-    for stage, other in theirs["kernels"].items():
-        text = "-" if other is None else f"{other:.2f}"
-        row[f"{stage}, kernels"] = f"{result['kernels'][stage]:.2f} / {text}"
+    for stage in theirs["kernels"]:
+        both = theirs["our kernels"][stage], theirs["kernels"][stage]
+        row[f"{stage}, kernels"] = " / ".join("-" if time is None else f"{time:.2f}" for time in both)
     return row | {f"{what}, ratio": ratio for what, ratio in theirs["ratios"].items()}
 
 
