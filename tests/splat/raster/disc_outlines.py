@@ -1,4 +1,4 @@
-"""The figure of docs/research/geometry.md on flat discs: python tests/splat/raster/disc_outlines.py RUN DATA      seconds
+"""The figure of docs/research/geometry.md on flat discs: python tests/splat/raster/disc_outlines.py RUN DATA    seconds
 
 Discs are projected as flat Gaussians, to first order about their centres (EWA, Zwicker et al. 2002). Where a ray meets
 a disc (2DGS, Huang et al. 2024) differs from that by how much perspective bends its outline. Prints by how much, in
