@@ -30,6 +30,7 @@ from spacesim.data.errors import InputError, WorkError
 ALIGNMENT = 64  #: bytes, of arrays in shared memory
 ATTEMPTS = 3  #: processes that may end over the same work
 PATIENCE = 5.0  #: seconds in which processes end after they are asked to
+CRASH = 60.0  #: seconds in which they end where they are not: what was in memory may be written to a file
 _ROOT = str(Path(__file__).parents[1])
 
 
@@ -81,18 +82,22 @@ class ChildProcess:
         if self._memory is not None:
             self._memory.close()
 
-    def wait(self, patience: float = PATIENCE) -> None:
-        """Until it has ended; after so many seconds it is killed."""
+    def wait(self, patience: float = PATIENCE) -> bool:
+        """Until it has ended; after so many seconds it is killed. Whether it ended by itself."""
         try:
             self._process.wait(patience)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+            return False
+        return True
 
     def ending(self) -> str:
-        """How it ended, in words, once it does so by itself."""
+        """How it ended, in words, once it does so by itself, for which it has `CRASH` seconds."""
         self.close()
-        code = self._process.wait()
+        if not self.wait(CRASH):
+            return "closed its connection and did not end"
+        code = self._process.returncode
         return f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
 
 

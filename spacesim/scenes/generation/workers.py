@@ -138,9 +138,9 @@ def _requeue(worker: _Worker, tasks: deque[_Task]) -> None:
     if worker.tasks[0].deaths < ATTEMPTS:
         tasks.extendleft(reversed(worker.tasks))
         return
-    first, last = worker.tasks[0].specs[0].name, worker.tasks[-1].specs[-1].name
+    left = [spec.name for task in worker.tasks for spec in task.specs if spec.name in task.left]
     raise WorkError(
-        f"{first} to {last}: {ATTEMPTS} processes ended over these frames, the last {ending}; "
+        f"{left[0]} to {left[-1]}: {ATTEMPTS} processes ended over these frames, the last {ending}; "
         "where the memory is short, fewer workers help"
     )
 

@@ -119,6 +119,23 @@ def test_frames_that_kill_every_process_end_in_a_sentence(job, monkeypatch):
         list(make_in_processes(work, specs, 1))
 
 
+def test_the_sentence_names_frames_that_are_not_made(job):
+    specs = job[1]
+    task, later = workers._Task(specs[:3], deaths=2), workers._Task(specs[3:5])
+    worker = workers._Worker(_Ended(), deque([task, later]), [])
+    for made in (specs[0], specs[4]):
+        worker.has_made(made.name)
+    with pytest.raises(WorkError, match=f"^{specs[1].name} to {specs[3].name}: 3 processes ended .* ended with code 7"):
+        workers._requeue(worker, deque())
+
+
+class _Ended:
+    """A process that has ended by itself."""
+
+    def ending(self) -> str:
+        return "ended with code 7"
+
+
 def test_an_error_in_a_worker_is_raised_unchanged(job, tmp_path):
     work, specs = job
     (tmp_path / "file").write_text("no folder")
