@@ -14,7 +14,8 @@ from spacesim.data.structure import checked
 from spacesim.splat.raster.blend import blend_planes, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
-from spacesim.splat.raster.lists.bin import Boxes, Grid, bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.lists.bin import Boxes, bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.lists.boxes import Grid
 from spacesim.splat.raster.lists.pictures import Kind, expected_capacity, observe
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha

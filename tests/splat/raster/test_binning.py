@@ -13,7 +13,7 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
-from spacesim.splat.raster.lists import tiles
+from spacesim.splat.raster.lists import boxes, tiles
 from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 
@@ -99,7 +99,7 @@ def test_slots_are_the_splats_own(way):
 @pytest.mark.parametrize(("count", "size"), [(2000, (64, 64)), (500, (33, 90)), (9000, (8, 8))])
 def test_both_ways_list_the_same(count, size, monkeypatch):
     splats, footprints = projected(count, *size)
-    monkeypatch.setattr(binning, "tile_shape", lambda *_: tiles.TileShape(16, 8, 16))
+    monkeypatch.setattr(boxes, "tile_shape", lambda *_: tiles.TileShape(16, 8, 16))
     found = []
     for name in WAYS:
         use(name, monkeypatch)
@@ -195,6 +195,17 @@ def test_segment_ids_of_slots(number, segments):
     ends = upload(np.cumsum(counts).astype(number.lower()), getattr(ad, number))
     found = np.array(segment_ids(ends, dr.arange(ad.UInt32, int(counts.sum()) + 2), segments))
     np.testing.assert_array_equal(found, [*np.repeat(np.arange(segments), counts), segments, segments])
+
+
+def test_quotients_of_floats_are_those_of_integers():
+    """Also of multiples and their neighbours, where floats round to the next."""
+    rng = np.random.default_rng(0)
+    by = rng.integers(1, 4097, 200_000)
+    number = np.minimum(rng.integers(0, 4096, by.size) * by + rng.integers(-1, 2, by.size), 2**24 - 1)
+    by, number = np.append(by, [1, 2**12, 3]), np.append(np.maximum(number, 0), [2**24 - 1] * 3)
+    down, across = boxes._divided(upload(number.astype(np.uint32), ad.UInt32), upload(by.astype(np.float32), ad.Float))
+    np.testing.assert_array_equal(np.array(down), number // by)
+    np.testing.assert_array_equal(np.array(across), number % by)
 
 
 def test_pairs_are_numbered_in_few_bits_where_they_fit(way):

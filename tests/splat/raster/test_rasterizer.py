@@ -17,7 +17,7 @@ from spacesim.splat.raster import records, walks
 from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.lists import bin as binning
-from spacesim.splat.raster.lists import tiles
+from spacesim.splat.raster.lists import boxes, tiles
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.render import render
 from spacesim.splat.reference.rasterizer import real_spherical_harmonics, render_reference
@@ -457,7 +457,7 @@ SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1)
 @pytest.mark.parametrize("shape", SHAPES[:1] + SHAPES[3:6])
 def test_any_tile_shape_blends_the_same(shape, monkeypatch):
     """Threads that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
-    monkeypatch.setattr(binning, "tile_shape", lambda *_: tiles.TileShape(*shape))
+    monkeypatch.setattr(boxes, "tile_shape", lambda *_: tiles.TileShape(*shape))
     arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)
     ours, twin = picture(arrays, view), render_reference(arrays, view)
     np.testing.assert_allclose(ours["color"], twin.color, atol=1e-5)

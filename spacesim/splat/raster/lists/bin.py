@@ -20,9 +20,10 @@ from spacesim.backend import ad, free_memory, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber
 from spacesim.data.errors import WorkError
+from spacesim.splat.raster.lists.boxes import Grid, box_records, tile_of_pair
 from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
-from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity, tile_shape
-from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
+from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity
+from spacesim.splat.raster.project import Footprints, Splats
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
@@ -39,34 +40,12 @@ TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a trai
 BELIEVED = 0.1  #: seconds for which memory that was free is taken to be
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The tiles of a picture, all of one shape."""
-
-    columns: int  #: tiles in a row
-    rows: int  #: rows of tiles
-    shape: TileShape  #: of each
-
-    @staticmethod
-    def of(width: int, height: int) -> "Grid":
-        """For a picture of width x height pixels."""
-        shape = tile_shape(width, height)
-        return Grid(-(-width // shape.width), -(-height // shape.height), shape)
-
-    @property
-    def tiles(self) -> int:
-        """How many they are."""
-        return self.columns * self.rows
-
-
 @dataclass
 class Boxes:
     """Of splats [M]: the tiles that the box around each reaches."""
 
-    left: UInt32  #: column of the first
-    top: UInt32  #: row of the first
-    columns: UInt32  #: in a row
-    count: UInt32  #: of all, 0 for what cannot be seen
+    records: list[Float]  #: of `box_records`
+    count: UInt32  #: of the tiles, 0 for what cannot be seen
     order: UInt32 | None  #: the splats in the order in which pairs are numbered, None: that of their indices
     pair_ends: UInt32 | UInt64  #: pairs up to and including each splat, in that order
 
@@ -215,43 +194,28 @@ _found = _Found()
 @recorded
 def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
-    left, top, columns, pairs, _ = _boxes_in_tiles(splats, footprints, count, capacity, grid)
+    records, pairs, _ = box_records(splats, footprints, count, capacity, grid)
     numbers = _number_type(capacity, grid)(pairs)
-    dr.eval(left, top, columns, pairs, numbers)
-    return Boxes(left, top, columns, pairs, None, _running_sum(numbers))
+    dr.eval(records, pairs, numbers)
+    return Boxes(records, pairs, None, _running_sum(numbers))
 
 
 @recorded
 def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
-    left, top, columns, pairs, live = _boxes_in_tiles(splats, footprints, count, capacity, grid)
+    records, pairs, live = box_records(splats, footprints, count, capacity, grid)
     # Splats that cannot be seen have no pairs, so their place does not matter.
     index = dr.arange(ad.UInt32, capacity)
     key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
-    dr.eval(left, top, columns, pairs, key)
+    dr.eval(records, pairs, key)
     order = _stable_order(key, 32)
     numbers = _number_type(capacity, grid)(dr.gather(ad.UInt32, pairs, order))
-    return Boxes(left, top, columns, pairs, order, _running_sum(numbers))
+    return Boxes(records, pairs, order, _running_sum(numbers))
 
 
 def _number_type(capacity: int, grid: Grid) -> type[UInt32] | type[UInt64]:
     """Of integers that hold the number of pairs, whatever so many splats reach."""
     return ad.UInt32 if capacity * grid.tiles < 2**32 else ad.UInt64
-
-
-def _boxes_in_tiles(
-    splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid
-) -> tuple[UInt32, UInt32, UInt32, UInt32, Bool]:
-    """(left, top, columns, pairs, whether it can be seen) of each splat's box, [M] = [capacity]."""
-    index = dr.arange(ad.UInt32, capacity)
-    live = index < count
-    live &= dr.gather(ad.Bool, footprints.visible, index, live)
-    x, y, half_width, half_height = (
-        dr.gather(ad.Float, v, index, live) for v in (splats.x, splats.y, footprints.half_width, footprints.half_height)
-    )
-    x0, x1 = _tile_range(x, half_width, grid.shape.width, grid.columns)
-    y0, y1 = _tile_range(y, half_height, grid.shape.height, grid.rows)
-    return x0, y0, dr.maximum(x1 - x0, 1), dr.select(live, (x1 - x0) * (y1 - y0), ad.UInt32(0)), live
 
 
 def _running_sum(values: UInt32 | UInt64) -> UInt32 | UInt64:
@@ -273,7 +237,7 @@ def _count(
     splat = segment_ids(ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity)  # beyond the last: its splat
     splat = dr.minimum(splat, splat_capacity - 1)  # where there are no pairs
     before = ad.UInt32(dr.gather(type(ends), ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
-    tile = _tile_of(splats, boxes, splat, slot - before, slot < total, grid)
+    tile = tile_of_pair(boxes.records, splat_capacity, splat, slot - before, slot < total, grid)
     key = dr.gather(ad.UInt32, footprints.order, splat)
     first_slot, slot_count = ad.UInt32(ends) - boxes.count, dr.select(fits, boxes.count, 0)
     splat, slot, start, end, order = ordered_lists(tile, key, splat, grid.tiles, capacity)
@@ -308,13 +272,15 @@ def _expand(
     slot = dr.arange(ad.UInt32, capacity)
     splat = dr.gather(ad.UInt32, boxes.order, rank)
     within = slot - dr.gather(ad.UInt32, first, rank)
-    tile = _tile_of(splats, boxes, splat, within, slot < total, grid)
+    tile = tile_of_pair(boxes.records, splat_capacity, splat, within, slot < total, grid)
     count = grid.tiles
     slot = _stable_order(tile, count.bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
     splat = dr.gather(ad.UInt32, splat, slot)
     dr.eval(tile, splat)
-    start, end = _runs(tile, count, capacity)
+    number = dr.arange(ad.UInt32, count)
+    start, end = (segment_ids(tile, other, capacity) for other in (number - 1, number))
+    start = dr.select(number > 0, start, 0)
     order = _longest_first(end - start, grid.shape)
     place = dr.empty(ad.UInt32, capacity)
     dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
@@ -359,37 +325,6 @@ def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
     return dr.gather(ad.UInt32, sorted_, dr.select(is_dealt, (turn * shares + share) * group + within, index))
 
 
-def _tile_of(splats: Splats, boxes: Boxes, splat: UInt32, within: UInt32, exists: Bool, grid: Grid) -> UInt32:
-    """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
-    misses the tile."""
-    columns = dr.maximum(dr.gather(ad.UInt32, boxes.columns, splat), 1)
-    column = dr.gather(ad.UInt32, boxes.left, splat) + within % columns
-    row = dr.gather(ad.UInt32, boxes.top, splat) + within // columns
-    listed = exists & _touches(splats, splat, column, row, grid.shape)
-    return dr.select(listed, row * grid.columns + column, grid.tiles)
-
-
-def _touches(splats: Splats, splat: UInt32, column: UInt32, row: UInt32, shape: TileShape) -> Bool:
-    """Does the ellipse {alpha >= ALPHA_MIN} of a splat reach a pixel centre's rectangle of a tile? [P] each.
-
-    Outside its centre a convex quadratic is least, over a rectangle, on an edge that faces the centre.
-    """
-    x, y, a, b, c, opacity = (
-        dr.gather(ad.Float, v, splat) for v in (splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity)
-    )
-    left, top = ad.Float(column * shape.width) + 0.5 - x, ad.Float(row * shape.height) + 0.5 - y
-    right, bottom = left + (shape.width - 1), top + (shape.height - 1)
-    near_x, near_y = dr.clip(0, left, right), dr.clip(0, top, bottom)
-    on_column = dr.clip(-b * near_x * dr.rcp(c), top, bottom)  # least along the facing vertical edge
-    on_row = dr.clip(-b * near_y * dr.rcp(a), left, right)
-
-    def form(dx: Float, dy: Float) -> Float:
-        return a * dx * dx + 2 * b * dx * dy + c * dy * dy
-
-    least = dr.minimum(form(near_x, on_column), form(on_row, near_y))
-    return least <= 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
-
-
 def _stable_order(keys: UInt32, bits: int) -> UInt32:
     """Indices that sort `keys` [N] of so many bits: a radix sort that knows how few digits there are, where dr.argsort
     goes through all 32 bits."""
@@ -407,23 +342,3 @@ def _stable_order(keys: UInt32, bits: int) -> UInt32:
             keys = dr.gather(ad.UInt32, keys, moved)
         del digit, plain, moved  # what is over goes: memory is short here
     return order
-
-
-def _tile_range(center: Float, half: Float, size: int, tiles: int) -> tuple[UInt32, UInt32]:
-    """Half-open range of tile indices that [center - half, center + half] touches, UInt32 [N] each."""
-    low = dr.clip(dr.floor((center - half) / size), 0, tiles)
-    high = dr.clip(dr.floor((center + half) / size) + 1, low, tiles)
-    return ad.UInt32(low), ad.UInt32(high)
-
-
-def _runs(tile: UInt32, tiles: int, capacity: int) -> tuple[UInt32, UInt32]:
-    """First and one-past-last position of each tile's run in the sorted array `tile` [capacity]; 0, 0 where it has
-    none. Entries of `tiles` and above are in no tile."""
-    position = dr.arange(ad.UInt32, capacity)
-    previous = dr.gather(ad.UInt32, tile, dr.select(position > 0, position - 1, 0))
-    following = dr.gather(ad.UInt32, tile, dr.minimum(position + 1, capacity - 1))
-    start, end = dr.zeros(ad.UInt32, tiles), dr.zeros(ad.UInt32, tiles)
-    listed = tile < tiles
-    dr.scatter(start, position, tile, active=listed & ((position == 0) | (previous != tile)))
-    dr.scatter(end, position + 1, tile, active=listed & ((position == capacity - 1) | (following != tile)))
-    return start, end
