@@ -235,7 +235,7 @@ def by_buckets(
         px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5
         (total, *gradients), (transmittance, *shown), last = pixel
         behind = total
-        for gradient, feature in zip(gradients, shown, strict=False):
+        for gradient, feature in zip(gradients, shown, strict=True):
             behind = dr.fma(-gradient, feature, behind)
         sums = [list(of_pair) for of_pair in sums]
         for i, record in enumerate(records):

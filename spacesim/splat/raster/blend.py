@@ -102,7 +102,6 @@ def blend_planes(
     if cut:  # where a list is empty, nobody writes
         nothing = finish(ad.Float(1), [ad.Float(0)] * channels)
         planes = [value + dr.zeros(ad.Float, width * height) for value in nothing]
-        dr.eval(planes)
     for p, (i, j) in enumerate(thread_offsets(shape)):
         column, row = thread.column + i, thread.row + j
         inside = walks.writes[p] & (column < width) & (row < height)

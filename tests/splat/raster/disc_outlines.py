@@ -16,7 +16,7 @@ from spacesim.splat.run import load_run
 
 SHARES = 50, 90, 99, 100
 SPREAD = 2  #: standard deviations of an outline
-ANGLES = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+ANGLES = np.linspace(0, 2 * np.pi, 256, endpoint=False)
 
 
 def displacements(means: np.ndarray, axes: np.ndarray, camera: Camera) -> np.ndarray:

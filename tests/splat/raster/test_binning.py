@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from spacesim.backend import ad, recordings, select
+from spacesim.backend import ad, recorded, recordings, select
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
@@ -163,9 +163,31 @@ def test_lists_made_without_a_wait_are_the_same_where_they_fit(way, spare):
     assert number.wait() == sum(map(len, listed(lists))) == 0
 
 
+def assert_longest_first(order: np.ndarray, lengths) -> None:
+    """Each list once, and none before one that is longer by a class; all of 1,448 and more are of one class."""
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(lengths)))
+    longest_first = np.minimum(np.array(lengths), 1447)[order] + 1.0
+    assert (longest_first[1:] <= longest_first[:-1] * 2 ** (1 / 6) + 1e-3).all()
+
+
+def test_thousands_of_lists_are_named_longest_first():
+    """More than a block of threads has; by a recording that is replayed for other lengths."""
+    order_of = recorded(lambda *arrays: ordered_lists(*arrays, 4000, 65536)[2:])
+    for seed in range(3):
+        lengths = np.random.default_rng(seed).choice([0, 0, 1, 7, 40, 150], 4000)[: 4000 - seed]
+        members = np.repeat(np.arange(len(lengths)), lengths)[:60000]
+        lengths = np.bincount(members, minlength=4000)
+        members = np.concatenate([members, np.full(65536 - len(members), 4000)])
+        numbers = np.arange(65536)
+        arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, numbers % 5, numbers))
+        start, end, order = (np.array(values) for values in order_of(*arrays))
+        np.testing.assert_array_equal(end - start, lengths)
+        assert_longest_first(order, lengths)
+
+
 @pytest.mark.parametrize("sizes", [(4, 16), (4, 4096), (64, 4096), (8, 8), (4, 8, 32, 128), (2, 4, 8, 4096), None])
 @pytest.mark.parametrize(
-    "lengths", [[1], [0, 5, 0], [300, 0, 17, 1, 64], [16, 4, 15, 17, 3], [2000, 3, 1500], [0, 0, 1]]
+    "lengths", [[1], [0, 5, 0], [300, 0, 17, 1, 64], [16, 4, 15, 17, 3], [1500, 3, 2000], [0, 0, 1]]
 )
 def test_lists_of_any_length_are_ordered(lengths, sizes):
     """Against numpy's sort; lists longer than a run, as long, and shorter; many equal keys."""
@@ -178,9 +200,7 @@ def test_lists_of_any_length_are_ordered(lengths, sizes):
     arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, keys, numbers))
     number, source, start, end, order = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, sizes))
     np.testing.assert_array_equal(end - start, lengths)
-    np.testing.assert_array_equal(np.sort(order), np.arange(len(lengths)))
-    longest_first = np.array(lengths)[order] + 1
-    assert (longest_first[1:] <= longest_first[:-1] * 2 ** (1 / 6) + 1e-3).all()
+    assert_longest_first(order, lengths)
     for i, (s, e) in enumerate(zip(start, end, strict=True)):
         mine = np.flatnonzero(members == i)
         wanted = mine[np.lexsort((numbers[mine], keys[mine]))]

@@ -434,7 +434,7 @@ def test_frames_keep_nothing_for_an_adjoint(monkeypatch):
 
     def spied(plain):
         def call(*arguments, **named):
-            buckets.append(arguments[6] if len(arguments) > 6 else None)
+            buckets.append(arguments[6] if len(arguments) > 6 else named.get("bucket"))
             return plain(*arguments, **named)
 
         return call

@@ -59,7 +59,8 @@ class TileLists:
     tiles_x: int  #: tiles in a row
     tiles_y: int  #: rows of tiles
     shape: TileShape  #: size of a tile, and how threads share its pixels
-    #: the tiles in the order in which they are given to threads [T], or None for that of their indices
+    #: the tiles in the order in which they are given to threads [T], or None for that of their indices: no result
+    #: depends on it, and on CUDA it may be another each time
     order: UInt32 | None = None
     #: where each slot's pair stands in `splat` [P], or None: sums of pairs are then kept by slots (`sum_index`)
     place: UInt32 | None = None

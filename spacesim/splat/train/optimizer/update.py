@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import drjit as dr
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
 from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import Pinhole
@@ -217,5 +217,8 @@ def _step(
 def _numbers(factors: Float, first: int, count: int) -> tuple[tuple[Float, Float], list[Float]]:
     """Adam's two corrections, and the step sizes of `count` rows from number `first` on."""
     indices = 0, 1, *range(2 + first, 2 + first + count)
-    first_correction, second_correction, *rates = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in indices]
+    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in indices]
+    if select() == "llvm":
+        dr.eval(numbers)  # each packet of SIMD lanes would gather them
+    first_correction, second_correction, *rates = numbers
     return (first_correction, second_correction), rates
