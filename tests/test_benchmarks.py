@@ -245,6 +245,23 @@ def test_rasterizer_tells_growth_and_goes_on_without_its_peer(command, place):
     assert len(list(ElementTree.parse(place / "growth.svg").iter(f"{SVG}circle"))) == 2
 
 
+def test_a_peers_kernels_and_ours_are_by_one_profiler():
+    """A frame that takes ours half of the peer's by it, whatever Dr.Jit says; none where the profiler sees nothing."""
+    import rasterizer
+    from support.common import Timing
+
+    clock = {"frame": Timing.of([3e-3])}
+    peer = {"clock": {"frame": Timing.of([4e-3])}, "kernels": {"frame": 2.0}, "our kernels": {"frame": 1.0}}
+    ours = {"gaussians": 7, "pixels": 8, "clock": clock, "kernels": {"frame": 9.0}, "peers": {"other": peer}}
+    peer["ratios"] = rasterizer.ratios(ours, peer)
+    assert peer["ratios"] == pytest.approx({"frame, clock": 0.75, "frame, kernels": 0.5})
+    assert rasterizer.peer_row(ours, "other")["frame, kernels"] == "1.00 / 2.00"
+    unseen = {**peer, "our kernels": {"frame": None}}
+    assert rasterizer.ratios(ours, unseen) == pytest.approx({"frame, clock": 0.75})
+    ours["peers"]["other"] = unseen
+    assert rasterizer.peer_row(ours, "other")["frame, kernels"] == "- / 2.00"
+
+
 @smallest(
     "schedule.py --out out --data DATA --methods vanilla --strategy mesh-aware --preset demo --iterations 110 --views 1"
     " --svg curve.svg --backend llvm --json"
