@@ -196,6 +196,10 @@ class _Buckets:
     end: UInt32
 
 
+_BucketPixel = tuple[list[Float], list[Float], UInt32]
+"""Of a pixel: its `_pixel_packets`, its state before a bucket, one past the last pair that it blends."""
+
+
 @recorded
 def by_buckets(
     splats: Splats,
@@ -217,8 +221,7 @@ def by_buckets(
     records = [_record(state, buckets, i, lists) for i in range(bucket)]
     until = dr.select(buckets.reached, ad.UInt32(pixels), ad.UInt32(0))
 
-    def read(q: UInt32) -> tuple[list[Float], list[Float], UInt32]:
-        """Of a pixel: its `_pixel_packets`, its state before the bucket, one past the last pair that it blends."""
+    def read(q: UInt32) -> _BucketPixel:
         exists, place = q < until, buckets.tile * pixels + q
         looked = load(looks, place, tiles * pixels, exists)
         kept = load(state.checkpoints, number * pixels + q, bucket_count * pixels, exists)
@@ -228,8 +231,8 @@ def by_buckets(
         return q < until
 
     def visit(
-        q: UInt32, pixel: tuple[list[Float], list[Float], UInt32], sums: list[list[Float]]
-    ) -> tuple[UInt32, tuple[list[Float], list[Float], UInt32], list[list[Float]]]:
+        q: UInt32, pixel: _BucketPixel, sums: list[list[Float]]
+    ) -> tuple[UInt32, _BucketPixel, list[list[Float]]]:
         following = read(q + 1)  # on its way while this one is added
         column, row = pixel_in_tile(q, shape)
         px, py = buckets.left + ad.Float(column) + 0.5, buckets.top + ad.Float(row) + 0.5

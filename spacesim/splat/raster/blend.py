@@ -67,12 +67,11 @@ def blend_lists(
     height: int,
     capacity: int,
     bucket: int | None = None,
-    packed: list[Float] | None = None,
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for that by tiles, None where there is none;  packed: `pack_records`, where they are there"""
+    adjoint, 0 for that by tiles, None where there is none"""
     (transmittance, *sums), kept = blend_planes(
-        splats, features, lists, (width, height), capacity, lambda passed, sums: [passed, *sums], bucket, packed
+        splats, features, lists, (width, height), capacity, lambda passed, sums: [passed, *sums], bucket
     )
     return BlendResult(sums, transmittance, kept)
 
@@ -87,7 +86,8 @@ def blend_planes(
     bucket: int | None = None,
     packed: list[Float] | None = None,
 ) -> tuple[list[Float], BlendState | None]:
-    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`."""
+    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. packed:
+    `pack_records`, where they are there"""
     (width, height), shape, channels = image_size, lists.shape, len(features)
     assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
     records = list_records(splats, features, lists, capacity, packed)

@@ -71,7 +71,7 @@ def ordered_lists(
     end = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=False)
     start = end - lengths
     counts, class_ = dr.zeros(ad.UInt32, CLASSES), _class_of(lengths)
-    rank = cast(UInt32, dr.scatter_inc(counts, class_, dr.full(ad.Bool, True, lists)))
+    rank = cast(UInt32, dr.scatter_inc(counts, class_))
     dr.eval(start, end, rank, class_, counts)
     by_length = dr.empty(ad.UInt32, lists)
     dr.scatter(by_length, dr.arange(ad.UInt32, lists), _count_longer(counts, class_) + rank)
