@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from drjit.auto.ad import (
         Array2f,
+        Array2u64,
         Array3f,
         Array4f,
         ArrayXf,
@@ -20,13 +21,14 @@ if TYPE_CHECKING:
         UInt64,
     )
 else:
-    Array2f = Array3f = Array4f = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array2u64 = Array3f = Array4f = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
 
 ArrayT = TypeVar("ArrayT", Float, Array3f)  #: the same type in and out
 NumberT = TypeVar("NumberT", Float, UInt32, Int32)  #: the same type in and out, of one dimension
 
 __all__ = [
     "Array2f",
+    "Array2u64",
     "Array3f",
     "Array4f",
     "ArrayT",

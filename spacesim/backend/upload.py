@@ -4,12 +4,13 @@ On LLVM, `ad.Float(values)` goes on reading numpy's own memory, and kernels read
 beyond its end: where the next page is not there, the process dies. What comes from numpy comes through here.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from spacesim.backend.arrays import Array3f
+from spacesim.backend.arrays import Array3f, UInt32
 from spacesim.backend.selection import ad
 
 VECTOR = 64  # elements of the widest vector, and more
@@ -35,3 +36,12 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 def upload_rows(rows: np.ndarray) -> Array3f:
     """Array3f [3, N] of an array [3, N]."""
     return ad.Array3f(*(upload(row) for row in rows))
+
+
+@lru_cache(maxsize=256)
+def held(number: int, role: str) -> UInt32:
+    """A number that is no part of a kernel's text, of width 1; the same array each time, for to make one is a launch.
+    role: what it is: arguments of a recording that have one value must be two arrays"""
+    array = dr.opaque(ad.UInt32, number)
+    dr.sync_thread()  # another thread may be the next to ask
+    return array

@@ -22,6 +22,7 @@ from spacesim.splat.raster.records import (
     exp2,
     list_records,
     load,
+    pack_records,
     packets,
     store,
 )
@@ -56,7 +57,7 @@ def listed(splats: Splats, features: list[Float], lists: TileLists) -> ListedSpl
 
 @recorded
 def _records(splats: Splats, features: list[Float], lists: TileLists, capacity: int) -> ListedRecords:
-    return list_records(splats, features, lists, capacity)
+    return list_records(pack_records(splats, features, capacity), lists, capacity)
 
 
 @dataclass

@@ -28,6 +28,7 @@ from spacesim.splat.raster.records import (
     exp2,
     exponents,
     list_records,
+    pack_records,
     store,
 )
 from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lists
@@ -70,27 +71,27 @@ def blend_lists(
 ) -> BlendResult:
     """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
     adjoint, 0 for that by tiles, None where there is none"""
+    packed, size = pack_records(splats, features, capacity), (width, height)
     (transmittance, *sums), kept = blend_planes(
-        splats, features, lists, (width, height), capacity, lambda passed, sums: [passed, *sums], bucket
+        packed, len(features), lists, size, capacity, lambda passed, sums: [passed, *sums], bucket
     )
     return BlendResult(sums, transmittance, kept)
 
 
 def blend_planes(
-    splats: Splats,
-    features: list[Float],
+    packed: list[Float],
+    channels: int,
     lists: TileLists,
     image_size: tuple[int, int],
     capacity: int,
     finish: Finish,
     bucket: int | None = None,
-    packed: list[Float] | None = None,
 ) -> tuple[list[Float], BlendState | None]:
     """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. packed:
-    `pack_records`, where they are there"""
-    (width, height), shape, channels = image_size, lists.shape, len(features)
+    `pack_records` of so many channels"""
+    (width, height), shape = image_size, lists.shape
     assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
-    records = list_records(splats, features, lists, capacity, packed)
+    records = list_records(packed, lists, capacity)
     walks = whole_lists(lists, channels)
     if cut := are_in_parts(lists, capacity):
         walks = in_parts(lists, channels, lambda first: _walk(lists, records, first)[:2])

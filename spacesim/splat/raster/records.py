@@ -74,14 +74,10 @@ def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[F
     return [store(values, index, capacity) for values in packets(numbers)]
 
 
-def list_records(
-    splats: Splats, features: list[Float], lists: TileLists, capacity: int, packed: list[Float] | None = None
-) -> ListedRecords:
-    """capacity: length of the splats' arrays;  packed: `pack_records`, where they are there"""
+def list_records(packed: list[Float], lists: TileLists, capacity: int) -> ListedRecords:
+    """packed: of `pack_records`, with this capacity"""
     if lists.capacity == 0:
         return ListedRecords([], capacity)
-    if packed is None:
-        packed = pack_records(splats, features, capacity)
     dr.eval(packed)
     if capacity < IN_ORDER[select()]:
         return ListedRecords(packed, capacity)

@@ -10,12 +10,15 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
+from spacesim.backend.readback import AsyncNumber, can_read_async
+from spacesim.backend.upload import held
 from spacesim.data.structure import checked
 from spacesim.splat.raster.blend import blend_planes, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
-from spacesim.splat.raster.lists.bin import Boxes, bin_splats, list_capacity, make_boxes, make_lists
-from spacesim.splat.raster.lists.boxes import Grid
+from spacesim.splat.raster.lists.bin import bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.lists.boxes import Boxes, Grid
+from spacesim.splat.raster.lists.counting import Capacities, picture_lists
 from spacesim.splat.raster.lists.pictures import Kind, expected_capacity, observe
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
@@ -25,6 +28,7 @@ from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals,
 
 PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
+MANY_PIXELS, MANY_SPLATS = 2**19, 2**14  #: from which on a picture on CUDA takes longer than to ask for it
 
 
 @checked
@@ -88,6 +92,10 @@ Planes = dict[str, list[Float]]
 """Planes of a picture, or what is blended to them, Floats [N], by the name of an output."""
 
 
+Counts = tuple[tuple[str, int], ...]
+"""Names of outputs, and how many planes each has."""
+
+
 Inputs = tuple[list[Float], Projection, int | None, tuple[str, ...], Bool | bool]
 """What `prepare` takes."""
 
@@ -97,32 +105,43 @@ def _draw_in_stages(
 ) -> tuple[TileLists | None, Planes]:
     """(the tiles' lists, planes) of what is blended in any number of passes, differentiable."""
     blended = blend(splats, footprints, _features(groups), camera)
-    return blended.lists, _finish(blended.planes, blended.transmittance, groups)
+    return blended.lists, _finish(blended.planes, blended.transmittance, _counts(groups))
 
 
-def _draw(inputs: Inputs, more: Planes, keeps_lists: bool) -> tuple[Splats | None, TileLists | None, Planes]:
-    """(splats and the tiles' lists, if they are wanted; planes) without gradients and in one pass: one recording where
-    the number of pairs is expected, which the host reads when all is drawn, two, between which it waits for it, where
-    it is not. More passes in one would hold the memory of all. more: blended beside the outputs"""
+def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | None, TileLists | None, Planes]:
+    """(splats, if they are wanted; the tiles' lists; planes) without gradients and in one pass; more would hold the
+    memory of all.
+
+    Where the number of pairs is expected, the host reads it when all is asked for: of a large picture while that is
+    blended, which takes a second recording, and that as long as some kernels. Where it is not, the host waits for it
+    between two recordings. more: blended beside the outputs"""
     rows, camera, *_ = inputs
     count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
-    live, most = dr.opaque(ad.UInt32, count), round_capacity(count)
+    live, most = held(count, "splats"), round_capacity(count)
+    counts = tuple((name, PLANES[name]) for name in PLANES if name in inputs[3]) + _counts(more)
     kind = Kind(most, *size, few_sizes=True)
     expected = expected_capacity(kind)
     if expected is not None:
-        drawn, pair_ends = _draw_at_once(inputs, more, live, expected, most, grid, keeps_lists)
-        pairs = int(pair_ends[most - 1])
+        listing = live, held(expected, "pairs"), Capacities(expected, most), grid
+        if size[0] * size[1] >= MANY_PIXELS and count >= MANY_SPLATS and can_read_async():
+            listed = _list_splats(inputs, more, keeps_splats, *listing)
+            number = AsyncNumber(listed.sums, grid.tiles - 1)
+            planes = _blend_records(listed.records, listed.lists, counts, size, most)
+            pairs = number.wait()
+        else:
+            listed, planes = _draw_at_once(inputs, more, keeps_splats, counts, *listing)
+            pairs = int(listed.sums[grid.tiles - 1])
         observe(kind, pairs)
         if 0 < pairs <= expected:
-            return drawn
-        del drawn  # frees memory for the next
+            return listed.splats, listed.lists, planes
+        del listed, planes  # frees memory for the next
     prepared = _prepare_boxes(inputs, more, live, most, grid)
-    pairs = prepared.boxes.pairs(count)
+    pairs = prepared.boxes.pairs
     capacity = list_capacity(pairs, size[0] * size[1], few_sizes=True)
     observe(kind, pairs)
     if capacity == 0:
         return prepared.splats, *_draw_in_stages(prepared.splats, prepared.footprints, prepared.groups, camera)
-    return prepared.splats, *_draw_boxes(prepared, size, capacity, most, grid, keeps_lists)
+    return prepared.splats, *_draw_boxes(prepared, counts, size, held(capacity, "pairs"), capacity, most, grid)
 
 
 @dataclass
@@ -136,15 +155,48 @@ class _Prepared:
     boxes: Boxes
 
 
+@dataclass
+class _Listed:
+    """A picture's Gaussians in lists."""
+
+    splats: Splats | None  #: where they are wanted
+    records: list[Float]  #: `pack_records` of all that is blended
+    lists: TileLists
+    sums: UInt32 | UInt64  #: of the lists' lengths
+
+
+@recorded
+def _list_splats(
+    inputs: Inputs,
+    more: Planes,
+    keeps_splats: bool,
+    count: UInt32,
+    limit: UInt32,
+    capacities: Capacities,
+    grid: Grid,
+) -> _Listed:
+    """Lists of `count` splats, of these capacities. more: blended beside the outputs"""
+    splats, footprints, groups = _prepare_all(inputs, more)
+    records, kept = pack_records(splats, _features(groups), capacities.splats), splats if keeps_splats else None
+    dr.schedule(records, kept)
+    return _Listed(kept, records, *picture_lists(splats, footprints, count, limit, capacities, grid))
+
+
 @recorded(elements=lambda arrays, inputs, *_: min(dr.width(arrays[0]), inputs[1].width * inputs[1].height))
 def _draw_at_once(
-    inputs: Inputs, more: Planes, count: UInt32, capacity: int, splat_capacity: int, grid: Grid, keeps_lists: bool
-) -> tuple[tuple[Splats | None, TileLists | None, Planes], UInt32 | UInt64]:
-    """(what `_draw` gives, with lists of `capacity`; up to where the splats' pairs are numbered)."""
+    inputs: Inputs,
+    more: Planes,
+    keeps_splats: bool,
+    counts: Counts,
+    count: UInt32,
+    limit: UInt32,
+    capacities: Capacities,
+    grid: Grid,
+) -> tuple[_Listed, Planes]:
+    """`_list_splats`, and the planes."""
+    listed = _list_splats(inputs, more, keeps_splats, count, limit, capacities, grid)
     size = inputs[1].width, inputs[1].height
-    prepared = _prepare_boxes(inputs, more, count, splat_capacity, grid)
-    drawn = _draw_boxes(prepared, size, capacity, splat_capacity, grid, keeps_lists)
-    return (prepared.splats if keeps_lists else None, *drawn), prepared.boxes.pair_ends
+    return listed, _blend_records(listed.records, listed.lists, counts, size, capacities.splats)
 
 
 @recorded
@@ -156,20 +208,33 @@ def _prepare_boxes(inputs: Inputs, more: Planes, count: UInt32, capacity: int, g
     return _Prepared(splats, footprints, groups, records, make_boxes(splats, footprints, count, capacity, grid))
 
 
-@recorded(elements=lambda _, _prepared, size, *_rest: size[0] * size[1])
+@recorded(elements=lambda _, _prepared, _counts, size, *_rest: size[0] * size[1])
 def _draw_boxes(
-    prepared: _Prepared, size: tuple[int, int], capacity: int, splat_capacity: int, grid: Grid, keeps_lists: bool
-) -> tuple[TileLists | None, Planes]:
-    """(the lists, of `capacity`, if they are wanted; planes)."""
-    splats, groups = prepared.splats, prepared.groups
-    lists = make_lists(splats, prepared.footprints, prepared.boxes, capacity, splat_capacity, grid)
+    prepared: _Prepared,
+    counts: Counts,
+    size: tuple[int, int],
+    limit: UInt32,
+    capacity: int,
+    splat_capacity: int,
+    grid: Grid,
+) -> tuple[TileLists, Planes]:
+    """(the lists, of `capacity`; planes)."""
+    lists = make_lists(prepared.footprints, prepared.boxes, limit, capacity, splat_capacity, grid)
+    return lists, _blend_records(prepared.records, lists, counts, size, splat_capacity)
+
+
+@recorded(elements=lambda _, _records, _lists, _counts, size, *_rest: size[0] * size[1])
+def _blend_records(
+    records: list[Float], lists: TileLists, counts: Counts, size: tuple[int, int], capacity: int
+) -> Planes:
+    """Planes of `records`, `pack_records` of all that is blended, with this capacity."""
 
     def finish(transmittance: Float, sums: list[Float]) -> list[Float]:
-        return _features(_finish(sums, transmittance, groups))
+        return _features(_finish(sums, transmittance, counts))
 
-    features = _features(groups)
-    planes, _ = blend_planes(splats, features, lists, size, splat_capacity, finish, packed=prepared.records)
-    return lists if keeps_lists else None, _by_name(planes[:-1], groups) | {"alpha": planes[-1:]}
+    channels = sum(count for _, count in counts)
+    planes, _ = blend_planes(records, channels, lists, size, capacity, finish)
+    return _by_name(planes[:-1], counts) | {"alpha": planes[-1:]}
 
 
 def _features(groups: Planes) -> list[Float]:
@@ -179,11 +244,11 @@ def _features(groups: Planes) -> list[Float]:
 @recorded
 def prepare(
     rows: list[Float], camera: Projection, sh_degree: int | None, outputs: tuple[str, ...], antialiased: Bool | bool
-) -> tuple[Splats, Footprints, dict[str, list[Float]]]:
+) -> tuple[Splats, Footprints, Planes]:
     """(splats, footprints, features to blend by output) of the Gaussians with these `rows`."""
     gaussians = Gaussians.from_rows(rows)
     splats, footprints = project(gaussians, camera, antialiased)
-    groups: dict[str, list[Float]] = {}
+    groups: Planes = {}
     if "color" in outputs:
         groups["color"] = list(view_colors(gaussians, camera, sh_degree))
     if "depth" in outputs:
@@ -205,15 +270,19 @@ def _whole_features(features: list[Float], count: int) -> list[Float]:
     return [feature if dr.width(feature) == count else feature + dr.zeros(ad.Float, count) for feature in features]
 
 
-def _by_name(planes: list[Float], groups: Planes) -> Planes:
+def _counts(groups: Planes) -> Counts:
+    return tuple((name, len(group)) for name, group in groups.items())
+
+
+def _by_name(planes: list[Float], counts: Counts) -> Planes:
     """Planes, one after another, by the names of what was blended."""
     rest = iter(planes)
-    return {name: [next(rest) for _ in group] for name, group in groups.items()}
+    return {name: [next(rest) for _ in range(count)] for name, count in counts}
 
 
-def _finish(planes: list[Float], transmittance: Float, groups: Planes) -> Planes:
+def _finish(planes: list[Float], transmittance: Float, counts: Counts) -> Planes:
     """Planes of what was blended by its names, with expected depth, unit normals and, last, "alpha"."""
-    finished = _by_name(planes, groups)
+    finished = _by_name(planes, counts)
     finished["alpha"] = [1 - transmittance]
     if "depth" in finished:
         finished["depth"] = [over_alpha(finished["depth"][0], finished["alpha"][0])]

@@ -12,7 +12,17 @@ from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, load, packets, store
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    exp2,
+    exponents,
+    list_records,
+    load,
+    pack_records,
+    packets,
+    store,
+)
 
 NONE = 2**32 - 1  #: in place of a splat's number
 THICKNESS = 0.05  #: of a disc, in its shorter standard deviation
@@ -75,7 +85,8 @@ def median_splat(splats: Splats, lists: TileLists, width: int, height: int) -> U
 @recorded(elements=lambda _, splats, lists, width, height, *_rest, **_named: width * height)
 def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: int) -> UInt32:
     """`median_splat` as a part of recordings. capacity: length of the splats' arrays"""
-    records, thread, pixels = list_records(splats, [], lists, capacity), thread_pixels(lists), lists.shape.pixels
+    records = list_records(pack_records(splats, [], capacity), lists, capacity)
+    thread, pixels = thread_pixels(lists), lists.shape.pixels
 
     def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
         return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)

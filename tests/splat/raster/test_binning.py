@@ -8,13 +8,13 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import ad, recorded, recordings, select
-from spacesim.backend.upload import upload
+from spacesim.backend.upload import held, upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
-from spacesim.splat.raster.lists import boxes, tiles
-from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
+from spacesim.splat.raster.lists import boxes, counting, tiles
+from spacesim.splat.raster.lists.sort import empty_entries, entry_of, list_bounds, ordered_entries, segment_ids
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 
 pytestmark = pytest.mark.threads
@@ -108,6 +108,26 @@ def test_both_ways_list_the_same(count, size, monkeypatch):
     assert sum(map(len, found[0])) > count / 2
 
 
+@pytest.mark.parametrize("many", [0, 250, 700])
+def test_splats_of_many_tiles_are_listed_as_others(many, monkeypatch):
+    """By threads of their own: all of them, most, and few; more pairs than such a splat has threads, too."""
+    size = 480, 340
+    splats, footprints = projected(60, *size)
+    found = []
+    for name in WAYS:
+        use(name, monkeypatch)
+        monkeypatch.setattr(boxes, "tile_shape", lambda *_: tiles.TileShape(8, 8, 32))
+        monkeypatch.setattr(counting, "MANY", many)
+        for function in ("count_boxes", "count_lists"):
+            monkeypatch.setattr(binning, function, getattr(counting, function).traced)
+        found.append(listed(binning.bin_splats(splats, footprints, *size)))
+        counts = np.array(binning.make_boxes(splats, footprints, held(60, "splats"), 1024, boxes.Grid.of(*size)).count)
+    assert found[0] == found[1]
+    assert (counts > many).sum() > 5
+    assert (counts[counts > 0] <= many).sum() > 5 or not many
+    assert counts.max() > 1024
+
+
 def test_equal_depths_are_in_index_order(way):
     """What shadow splatting relies on: of two events at one depth the first comes first."""
     splats, footprints = projected(600, 48, 48)
@@ -170,9 +190,21 @@ def assert_longest_first(order: np.ndarray, lengths) -> None:
     assert (longest_first[1:] <= longest_first[:-1] * 2 ** (1 / 6) + 1e-3).all()
 
 
+def in_lists(members, keys, numbers, lists: int, sizes=None):
+    """(numbers, sources, bounds) of entries, arrays UInt32 [P], in their lists; those of list `lists` are in none."""
+    size, listed = dr.width(members), members < lists
+    lengths = dr.zeros(ad.UInt32, lists)
+    dr.scatter_add(lengths, ad.UInt32(1), members, listed)
+    bounds = list_bounds(lengths, ad.UInt32, dr.opaque(ad.UInt32, size))
+    entries, place = empty_entries(size), dr.scatter_inc(bounds.cursor, members, listed)
+    dr.scatter(entries, entry_of(keys, numbers, members, dr.arange(ad.UInt32, size)), place, listed)
+    dr.eval(entries)
+    return *ordered_entries(entries, bounds, size, sizes=sizes), bounds
+
+
 def test_thousands_of_lists_are_named_longest_first():
     """More than a block of threads has; by a recording that is replayed for other lengths."""
-    order_of = recorded(lambda *arrays: ordered_lists(*arrays, 4000, 65536)[2:])
+    bounds_of = recorded(lambda *arrays: in_lists(*arrays, 4000)[2])
     for seed in range(3):
         lengths = np.random.default_rng(seed).choice([0, 0, 1, 7, 40, 150], 4000)[: 4000 - seed]
         members = np.repeat(np.arange(len(lengths)), lengths)[:60000]
@@ -180,9 +212,9 @@ def test_thousands_of_lists_are_named_longest_first():
         members = np.concatenate([members, np.full(65536 - len(members), 4000)])
         numbers = np.arange(65536)
         arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, numbers % 5, numbers))
-        start, end, order = (np.array(values) for values in order_of(*arrays))
-        np.testing.assert_array_equal(end - start, lengths)
-        assert_longest_first(order, lengths)
+        bounds = bounds_of(*arrays)
+        np.testing.assert_array_equal(np.array(bounds.end) - np.array(bounds.start), lengths)
+        assert_longest_first(np.array(bounds.order), lengths)
 
 
 @pytest.mark.parametrize("sizes", [(4, 16), (4, 4096), (64, 4096), (8, 8), (4, 8, 32, 128), (2, 4, 8, 4096), None])
@@ -198,9 +230,10 @@ def test_lists_of_any_length_are_ordered(lengths, sizes):
     size = len(members)
     keys, numbers = rng.integers(0, 9, size), rng.permutation(size)
     arrays = (upload(values.astype(np.uint32), ad.UInt32) for values in (members, keys, numbers))
-    number, source, start, end, order = (np.array(v) for v in ordered_lists(*arrays, len(lengths), size, sizes))
+    number, source, bounds = in_lists(*arrays, len(lengths), sizes)
+    number, source, start, end = (np.array(values) for values in (number, source, bounds.start, bounds.end))
     np.testing.assert_array_equal(end - start, lengths)
-    assert_longest_first(order, lengths)
+    assert_longest_first(np.array(bounds.order), lengths)
     for i, (s, e) in enumerate(zip(start, end, strict=True)):
         mine = np.flatnonzero(members == i)
         wanted = mine[np.lexsort((numbers[mine], keys[mine]))]
@@ -235,7 +268,7 @@ def test_pairs_are_numbered_in_few_bits_where_they_fit(way):
         grid = binning.Grid.of(*size)
         boxes = binning.make_boxes(splats, footprints, dr.opaque(ad.UInt32, 900), tiles.round_capacity(900), grid)
         assert type(boxes.pair_ends) is number
-        assert boxes.pairs(900) > 900
+        assert boxes.pairs > 900
 
 
 @pytest.mark.parametrize(

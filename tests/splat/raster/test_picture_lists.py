@@ -24,11 +24,14 @@ from spacesim.splat.raster.render import render
 KIND = Kind(2048, 64, 48)
 
 
-@pytest.fixture(autouse=True, params=["cuda", "llvm"])
+@pytest.fixture(autouse=True, params=["cuda", "llvm", "cuda, many pixels"])
 def on_any_backend(request, monkeypatch):
-    """Each backend's way of making lists, on the backend that runs."""
+    """Each backend's way of making lists, and a large picture's on CUDA, on the backend that runs."""
     assert can_read_async()
-    if request.param != select():
+    if "many" in request.param:
+        for name in ("MANY_PIXELS", "MANY_SPLATS"):
+            monkeypatch.setattr(f"spacesim.splat.raster.render.{name}", 1)
+    if request.param.split(",")[0] != select():
         if select() == "cuda":
             pytest.skip("Dr.Jit cannot replay its sort on CUDA")
         take_cudas(monkeypatch)

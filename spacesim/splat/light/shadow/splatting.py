@@ -18,7 +18,15 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
-from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, TRANSMITTANCE_MIN, exp2, exponents, list_records
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    TRANSMITTANCE_MIN,
+    exp2,
+    exponents,
+    list_records,
+    pack_records,
+)
 
 BETA_MIN = 0.2  #: a receiver's footprint ends there: 80 % of its weight on 29 % of the area of a cut at 1/255
 TURN = {"cuda": 4, "llvm": 1}  #: events a turn of the loop: their numbers are read at once
@@ -131,7 +139,7 @@ def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacit
     """[capacity]: what each receiver has lost. One thread holds a block of a tile's pixels."""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
-    records = list_records(events, [], lists, 2 * capacity)
+    records = list_records(pack_records(events, [], 2 * capacity), lists, 2 * capacity)
     receivers = dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text, as in `make_events`
     thread, (width, height) = thread_pixels(lists), image_size
     inside = [(thread.column + i < width) & (thread.row + j < height) for i, j in thread_offsets(shape)]

@@ -4,26 +4,28 @@ Each tile lists the splats whose ellipse reaches it, in depth order, ties in ind
 scheduling. Pairs of tile and splat come from the box around a splat's ellipse; those whose tile the ellipse misses are
 in no list. How the lists are put in order depends on the backend, the order does not:
 
-- CUDA counts the pairs into their tiles and orders each list by itself (`sort.py`): a radix sort's many launches
+- CUDA counts the pairs into their tiles and orders each list by itself (`counting.py`): a radix sort's many launches
   cost more than its work (docs/research/speed.md), and Dr.Jit 1.5 cannot replay them.
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, free_memory, recorded, select
-from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
+from spacesim.backend.arrays import UInt32
 from spacesim.backend.readback import AsyncNumber
+from spacesim.backend.upload import held
 from spacesim.data.errors import WorkError
-from spacesim.splat.raster.lists.boxes import Grid, box_records, tile_of_pair
-from spacesim.splat.raster.lists.sort import ordered_lists, segment_ids
+from spacesim.splat.raster.lists.boxes import Boxes, Grid, find_boxes, packed, tile_of_pair
+from spacesim.splat.raster.lists.counting import Capacities, count_boxes, count_lists
+from spacesim.splat.raster.lists.sort import segment_ids
 from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
+from spacesim.splat.raster.records import load
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
@@ -38,20 +40,6 @@ TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a trai
 #: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
 
 BELIEVED = 0.1  #: seconds for which memory that was free is taken to be
-
-
-@dataclass
-class Boxes:
-    """Of splats [M]: the tiles that the box around each reaches."""
-
-    records: list[Float]  #: of `box_records`
-    count: UInt32  #: of the tiles, 0 for what cannot be seen
-    order: UInt32 | None  #: the splats in the order in which pairs are numbered, None: that of their indices
-    pair_ends: UInt32 | UInt64  #: pairs up to and including each splat, in that order
-
-    def pairs(self, count: int) -> int:
-        """How many they are, of `count` splats. Waits for the device."""
-        return int(self.pair_ends[round_capacity(count) - 1])
 
 
 MakeLists = Callable[[Splats, Footprints, int, int], TileLists]
@@ -86,12 +74,12 @@ def bin_counted(
     """`bin_splats`, and how many pairs boxes have, which the lists' capacity is enough for."""
     splats = _detached(splats)
     boxes, grid, count = _find_boxes(splats, footprints, width, height)
-    pairs = 0 if boxes is None else boxes.pairs(count)
+    pairs = 0 if boxes is None else boxes.pairs
     capacity = list_capacity(pairs, width * height, few_sizes, training)
     if capacity == 0 or boxes is None:
         none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(count, 1))
         return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape), 0
-    return make_lists(splats, footprints, boxes, capacity, round_capacity(count), grid), pairs
+    return make_lists(footprints, boxes, held(capacity, "pairs"), capacity, round_capacity(count), grid), pairs
 
 
 def bin_async(
@@ -102,8 +90,9 @@ def bin_async(
     splats = _detached(splats)
     boxes, grid, count = _find_boxes(splats, footprints, width, height)
     assert boxes is not None, "lists without splats have no capacity"
-    pairs = AsyncNumber(boxes.pair_ends, round_capacity(count) - 1)  # copied before what comes next
-    return make_lists(splats, footprints, boxes, capacity, round_capacity(count), grid), pairs
+    assert boxes.pair_ends is not None
+    pairs = AsyncNumber(boxes.pair_ends, boxes.last)  # copied before what comes next
+    return make_lists(footprints, boxes, held(capacity, "pairs"), capacity, round_capacity(count), grid), pairs
 
 
 def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int) -> tuple[Boxes | None, Grid, int]:
@@ -111,12 +100,12 @@ def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int)
     grid, count = Grid.of(width, height), dr.width(splats.x)
     if count == 0:
         return None, grid, 0
-    return make_boxes(splats, footprints, dr.opaque(ad.UInt32, count), round_capacity(count), grid), grid, count
+    return make_boxes(splats, footprints, held(count, "splats"), round_capacity(count), grid), grid, count
 
 
 def make_boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats, [M] = [capacity], `round_capacity` of as many; may be part of a recording."""
-    return (_boxes if select() == "cuda" else _rank)(splats, footprints, count, capacity, grid)
+    return (count_boxes if select() == "cuda" else _rank)(splats, footprints, count, capacity, grid)
 
 
 def list_capacity(pairs: int, pixels: int, few_sizes: bool, training: bool = False) -> int:
@@ -131,11 +120,13 @@ def rounded_pairs(pairs: int, few_sizes: bool) -> int:
 
 
 def make_lists(
-    splats: Splats, footprints: Footprints, boxes: Boxes, capacity: int, splat_capacity: int, grid: Grid
+    footprints: Footprints, boxes: Boxes, limit: UInt32, capacity: int, splat_capacity: int, grid: Grid
 ) -> TileLists:
-    """Lists with a capacity for so many pairs; may be part of a recording. splat_capacity: M of the boxes"""
-    lists_of = _count if select() == "cuda" else _expand
-    return lists_of(splats, footprints, boxes, capacity, splat_capacity, grid)
+    """Lists with a capacity for so many pairs; may be part of a recording. They are empty where there are more than
+    `limit`, the capacity on the device. splat_capacity: M of the boxes"""
+    if select() == "cuda":
+        return count_lists(footprints, boxes, limit, Capacities(capacity, splat_capacity), grid)
+    return _expand(boxes, limit, capacity, splat_capacity, grid)
 
 
 def _detached(splats: Splats) -> Splats:
@@ -192,64 +183,32 @@ _found = _Found()
 
 
 @recorded
-def _boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
-    """Boxes of `count` splats; pairs are numbered in the order of the splats' indices."""
-    records, pairs, _ = box_records(splats, footprints, count, capacity, grid)
-    numbers = _number_type(capacity, grid)(pairs)
-    dr.eval(records, pairs, numbers)
-    return Boxes(records, pairs, None, _running_sum(numbers))
-
-
-@recorded
 def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
-    records, pairs, live = box_records(splats, footprints, count, capacity, grid)
-    # Splats that cannot be seen have no pairs, so their place does not matter.
     index = dr.arange(ad.UInt32, capacity)
+    live = index < count
+    live &= dr.gather(ad.Bool, footprints.visible, index, live)
+    # Splats that cannot be seen have no pairs, so their place does not matter.
     key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
+    half_width, half_height = (
+        dr.gather(ad.Float, half, index, live) for half in (footprints.half_width, footprints.half_height)
+    )
+    numbers, pairs = find_boxes(
+        Splats(*(dr.gather(ad.Float, values, index, live) for values in vars(splats).values())),
+        Footprints(half_width, half_height, live, key),
+        grid,
+    )
+    records = packed(numbers, index, capacity)
     dr.eval(records, pairs, key)
     order = _stable_order(key, 32)
-    numbers = _number_type(capacity, grid)(dr.gather(ad.UInt32, pairs, order))
-    return Boxes(records, pairs, order, _running_sum(numbers))
-
-
-def _number_type(capacity: int, grid: Grid) -> type[UInt32] | type[UInt64]:
-    """Of integers that hold the number of pairs, whatever so many splats reach."""
-    return ad.UInt32 if capacity * grid.tiles < 2**32 else ad.UInt64
-
-
-def _running_sum(values: UInt32 | UInt64) -> UInt32 | UInt64:
-    return dr.prefix_reduce(dr.ReduceOp.Add, values, exclusive=False)
-
-
-@recorded
-def _count(
-    splats: Splats,
-    footprints: Footprints,
-    boxes: Boxes,
-    capacity: int,
-    splat_capacity: int,
-    grid: Grid,
-) -> TileLists:
-    """Lists that are ordered one by one."""
-    slot, ends = dr.arange(ad.UInt32, capacity), boxes.pair_ends
-    fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
-    splat = segment_ids(ends, dr.minimum(slot, dr.maximum(total, 1) - 1), splat_capacity)  # beyond the last: its splat
-    splat = dr.minimum(splat, splat_capacity - 1)  # where there are no pairs
-    before = ad.UInt32(dr.gather(type(ends), ends, splat)) - dr.gather(ad.UInt32, boxes.count, splat)
-    tile = tile_of_pair(boxes.records, splat_capacity, splat, slot - before, slot < total, grid)
-    key = dr.gather(ad.UInt32, footprints.order, splat)
-    first_slot, slot_count = ad.UInt32(ends) - boxes.count, dr.select(fits, boxes.count, 0)
-    splat, slot, start, end, order = ordered_lists(tile, key, splat, grid.tiles, capacity)
-    size = grid.columns, grid.rows, grid.shape
-    return TileLists(splat, slot, start, end, first_slot, slot_count, capacity, *size, order, tile=tile)
+    wide = grid.number_type(capacity)(dr.gather(ad.UInt32, pairs, order))
+    return Boxes(records, pairs, count, dr.prefix_reduce(dr.ReduceOp.Add, wide, exclusive=False), order)
 
 
 @recorded
 def _expand(
-    splats: Splats,
-    _footprints: Footprints,
     boxes: Boxes,
+    limit: UInt32,
     capacity: int,
     splat_capacity: int,
     grid: Grid,
@@ -258,7 +217,7 @@ def _expand(
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
     assert boxes.order is not None
-    fits, total = _pairs_that_fit(boxes, capacity, splat_capacity)
+    fits, total = boxes.that_fit(limit)
     slot_count = dr.select(fits, boxes.count, 0)
     pairs_of = dr.gather(ad.UInt32, boxes.count, boxes.order)
     first = ad.UInt32(boxes.pair_ends) - pairs_of
@@ -272,7 +231,8 @@ def _expand(
     slot = dr.arange(ad.UInt32, capacity)
     splat = dr.gather(ad.UInt32, boxes.order, rank)
     within = slot - dr.gather(ad.UInt32, first, rank)
-    tile = tile_of_pair(boxes.records, splat_capacity, splat, within, slot < total, grid)
+    ellipse = load(boxes.records, splat, splat_capacity)
+    tile = tile_of_pair(ellipse, within, slot < total, grid)
     count = grid.tiles
     slot = _stable_order(tile, count.bit_length())
     tile = dr.gather(ad.UInt32, tile, slot)
@@ -288,15 +248,6 @@ def _expand(
     return TileLists(
         splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape, order, place
     )
-
-
-def _pairs_that_fit(boxes: Boxes, capacity: int, splat_capacity: int) -> tuple[Bool, UInt32]:
-    """Whether `capacity` is enough for all pairs, of width 1; how many they are, 0 where it is not. No number of a
-    kernel's text, which would be compiled for each."""
-    number = type(boxes.pair_ends)
-    pairs = dr.gather(number, boxes.pair_ends, ad.UInt32(splat_capacity - 1))
-    fits = pairs <= dr.opaque(number, capacity)
-    return fits, ad.UInt32(dr.select(fits, pairs, 0))
 
 
 def _longest_first(length: UInt32, shape: TileShape) -> UInt32:

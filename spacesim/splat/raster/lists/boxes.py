@@ -1,15 +1,16 @@
 """The tiles that the box around each splat reaches, and which of these its ellipse does."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.splat.raster.lists.tiles import TileShape, tile_shape
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
-from spacesim.splat.raster.records import load, packets, store
+from spacesim.splat.raster.records import packets, store
 
 
 @dataclass(frozen=True)
@@ -31,42 +32,84 @@ class Grid:
         """How many they are."""
         return self.columns * self.rows
 
+    def number_type(self, splats: int) -> type[UInt32] | type[UInt64]:
+        """Of integers that hold the number of pairs, whatever so many splats reach."""
+        return ad.UInt32 if splats * self.tiles < 2**32 else ad.UInt64
 
-def box_records(
-    splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid
-) -> tuple[list[Float], UInt32, Bool]:
-    """Of each of `count` splats, [M] = [capacity]: (what `tile_of_pair` reads, by packets; tiles of its box, 0 for what
-    cannot be seen; whether it can be)."""
-    index = dr.arange(ad.UInt32, capacity)
-    live = index < count
-    live &= dr.gather(ad.Bool, footprints.visible, index, live)
-    x, y, a, b, c, opacity, half_width, half_height = (
-        dr.gather(ad.Float, values, index, live)
-        for values in (
-            *(splats.x, splats.y, splats.a, splats.b, splats.c, splats.opacity),
-            *(footprints.half_width, footprints.half_height),
-        )
-    )
-    left, right = _tile_range(x, half_width, grid.shape.width, grid.columns)
-    top, bottom = _tile_range(y, half_height, grid.shape.height, grid.rows)
+
+@dataclass
+class Boxes:
+    """Of splats, [N] on CUDA, [M] on LLVM: the tiles that the box around each reaches."""
+
+    records: list[Float]  #: the numbers of `find_boxes`, `packed`
+    count: UInt32  #: of the tiles, 0 for what cannot be seen
+    splats: UInt32  #: how many they are, of width 1
+    pair_ends: UInt32 | UInt64 | None = None  #: pairs up to and including each splat, where pairs have numbers
+    #: the splats in the order in which pairs are numbered, None: that of their indices
+    order: UInt32 | None = None
+    large: UInt32 | None = None  #: on CUDA, splats of many tiles, in any order
+    large_count: UInt32 | None = None  #: on CUDA, how many they are, of width 1
+
+    @property
+    def last(self) -> int:
+        """Where `pair_ends` says how many pairs there are."""
+        return dr.width(self.pair_ends) - 1
+
+    @property
+    def pairs(self) -> int:
+        """How many they are. Waits for the device."""
+        assert self.pair_ends is not None, "pairs have no numbers"
+        return int(self.pair_ends[self.last])
+
+    def that_fit(self, limit: UInt32) -> tuple[Bool, UInt32]:
+        """Whether all pairs are within a limit, of width 1; how many they are, 0 where they are not."""
+        assert self.pair_ends is not None, "pairs have no numbers"
+        number = type(self.pair_ends)
+        pairs = dr.gather(number, self.pair_ends, self.splats - 1)
+        fit = pairs <= number(limit)
+        return fit, ad.UInt32(dr.select(fit, pairs, 0))
+
+
+def find_boxes(splats: Splats, footprints: Footprints, grid: Grid) -> tuple[list[Float], UInt32]:
+    """Of each splat, [N]: (the numbers that `tile_of_pair` reads; tiles of its box, 0 for what cannot be seen)."""
+    left, right = _tile_range(splats.x, footprints.half_width, grid.shape.width, grid.columns)
+    top, bottom = _tile_range(splats.y, footprints.half_height, grid.shape.height, grid.rows)
     columns = right - left
     corner = cast(Float, dr.reinterpret_array(ad.Float, left | (top << 16)))
-    most = 2 * dr.log(dr.maximum(opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
-    numbers = [x, y, a, b, c, most, corner, ad.Float(dr.maximum(columns, 1))]
-    records = [store(packet, index, capacity) for packet in packets(numbers)]
-    return records, dr.select(live, columns * (bottom - top), ad.UInt32(0)), live
+    most = 2 * dr.log(dr.maximum(splats.opacity / ALPHA_MIN, 1)) * (1 + 1e-4) + 1e-4
+    numbers = [splats.x, splats.y, splats.a, splats.b, splats.c, most, corner, ad.Float(dr.maximum(columns, 1))]
+    return numbers, dr.select(footprints.visible, columns * (bottom - top), ad.UInt32(0))
 
 
-def tile_of_pair(
-    records: list[Float], capacity: int, splat: UInt32, within: UInt32, exists: Bool, grid: Grid
-) -> UInt32:
+def packed(numbers: list[Float], index: UInt32, capacity: int) -> list[Float]:
+    """Numbers by packets, in arrays of `capacity`."""
+    return [store(packet, index, capacity) for packet in packets(numbers)]
+
+
+def tile_of_pair(ellipse: list[Float], within: UInt32, exists: Bool | bool, grid: Grid) -> UInt32:
     """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
-    misses the tile. records, capacity: of `box_records`"""
-    *ellipse, corner, columns = load(records, splat, capacity)
+    misses the tile. ellipse: the numbers of `find_boxes`"""
+    *form, corner, columns = ellipse
     first, (down, across) = cast(UInt32, dr.reinterpret_array(ad.UInt32, corner)), _divided(within, columns)
     column, row = (first & 0xFFFF) + across, (first >> 16) + down
-    listed = exists & _touches(ellipse, column, row, grid.shape)
+    listed = _touches(form, column, row, grid.shape) & exists
     return dr.select(listed, row * grid.columns + column, grid.tiles)
+
+
+def each_tile(
+    ellipse: list[Float], pairs: UInt32, lane: UInt32, lanes: int, grid: Grid, visit: Callable[[UInt32, UInt32], None]
+) -> None:
+    """Visit (the pair within its box, its tile) of the pairs of a splat, which `lanes` threads share; see
+    `tile_of_pair`."""
+
+    def has_more(within: UInt32) -> Bool:
+        return within < pairs
+
+    def visit_one(within: UInt32) -> tuple[UInt32]:
+        visit(within, tile_of_pair(ellipse, within, True, grid))
+        return (within + lanes,)
+
+    dr.while_loop((lane,), has_more, visit_one, mode="symbolic", label="tiles of splats")
 
 
 def _divided(number: UInt32, by: Float) -> tuple[UInt32, UInt32]:

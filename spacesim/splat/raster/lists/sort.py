@@ -1,8 +1,7 @@
-"""Lists in order without a sort over all of them: entries are counted into their lists, and each list is ordered by
-itself.
+"""Lists in order without a sort over all of them: each is ordered by itself.
 
-An entry's place among those of its list is taken by an atomic increment, so lists are unordered; then each entry
-counts how many of its list come before it. Key and number distinguish any two entries of a list: where one ends up does
+Entries are written into their lists as they come, each in a place taken by an atomic increment; then each counts how
+many of its list come before it. Key and number distinguish any two entries of a list: where one ends up does
 not depend on the order of the input. A list is ordered in runs: in the shortest each entry is compared with each; from
 runs of one size to those of the next an entry looks for its place in the others by bisection, and, in lists longer than
 the longest run, in all other runs. With runs of 64 and 4096 a list of L takes 64 + 64 log2 64 + L / 4096 log2 4096
@@ -10,12 +9,13 @@ steps an entry.
 """
 
 import itertools
+from dataclasses import dataclass
 from typing import cast
 
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Bool, UInt32, UInt64
+from spacesim.backend.arrays import Array2u64, Bool, UInt32, UInt64
 
 SIZES = 64, 4096  #: entries, powers of two: so many are compared each with each (with 32, 128 or 256 an H100 takes
 #: longer); of these as many as are searched in one pass, the lists of pictures being short
@@ -48,41 +48,69 @@ def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int
     return segment
 
 
-def ordered_lists(
-    members: UInt32,
-    keys: UInt32,
-    numbers: UInt32,
-    lists: int,
-    capacity: int,
-    sizes: tuple[int, ...] | None = None,
-) -> tuple[UInt32, UInt32, UInt32, UInt32, UInt32]:
-    """Entries [P] = [capacity] in lists, each ordered by key, then number: (number, entry) [P] one list after another,
-    where each list starts and ends, [lists], and all lists by classes of length, the longest first, those of a class in
-    any order. Entries whose list is `lists` are in none; what stands behind the last list has no meaning. UInt32 all;
-    no two entries of a list may have one key and number. Not differentiable.
+@dataclass
+class ListBounds:
+    """Of lists [T], one after another."""
 
-    sizes: of the runs that are made one from another, by default `SIZES`, `SIZES_OF_LONG` for lists that may be long
-    """
-    if sizes is None:
-        sizes = SIZES_OF_LONG if capacity > ROOM * lists else SIZES
-    lengths = dr.zeros(ad.UInt32, lists)
-    place = cast(UInt32, dr.scatter_inc(lengths, members, members < lists))
-    dr.eval(place, lengths, members, numbers, keys)
-    end = dr.prefix_reduce(dr.ReduceOp.Add, lengths, exclusive=False)
-    start = end - lengths
+    sums: UInt32 | UInt64  #: entries up to the end of each list
+    start: UInt32  #: of each list
+    end: UInt32  #: of each list
+    cursor: UInt32  #: the starts once more: an increment takes a list's next place
+    #: all lists by classes of length, the longest first, those of a class in any order
+    order: UInt32
+
+    def fit(self, limit: UInt32) -> Bool:
+        """Whether all entries are within a limit, of width 1."""
+        return _fit(self.sums, limit)
+
+
+def list_bounds(lengths: UInt32, number: type[UInt32] | type[UInt64], limit: UInt32) -> ListBounds:
+    """Where lists of these lengths [T] start and end, all evaluated; empty ones where there are more entries than
+    `limit`. number: of integers that hold the sum of the lengths"""
+    index, wide = dr.arange(ad.UInt32, dr.width(lengths)), number(lengths)
+    dr.eval(lengths, wide)
+    sums = dr.prefix_reduce(dr.ReduceOp.Add, wide, exclusive=False)
+    fit = _fit(sums, limit)
+    end = ad.UInt32(dr.select(fit, sums, 0))
+    start = dr.select(fit, end - lengths, 0)
     counts, class_ = dr.zeros(ad.UInt32, CLASSES), _class_of(lengths)
     rank = cast(UInt32, dr.scatter_inc(counts, class_))
     dr.eval(start, end, rank, class_, counts)
-    by_length = dr.empty(ad.UInt32, lists)
-    dr.scatter(by_length, dr.arange(ad.UInt32, lists), _count_longer(counts, class_) + rank)
-    dr.eval(by_length)
+    order, cursor = dr.empty(ad.UInt32, dr.width(lengths)), dr.gather(ad.UInt32, start, index)
+    dr.scatter(order, index, _count_longer(counts, class_) + rank)
+    dr.eval(order, cursor)
+    return ListBounds(sums, start, end, cursor, order)
 
+
+def _fit(sums: UInt32 | UInt64, limit: UInt32) -> Bool:
+    number = type(sums)
+    return dr.gather(number, sums, ad.UInt32(dr.width(sums) - 1)) <= number(limit)
+
+
+def empty_entries(capacity: int) -> UInt64:
+    """Room for so many `entry_of`, and some more behind them: a turn of `_count_before` may read beyond the end."""
+    return dr.empty(ad.UInt64, 2 * (capacity + COMPARED))
+
+
+def entry_of(key: UInt32, number: UInt32, list_: UInt32, source: UInt32) -> Array2u64:
+    """An entry of a list: what orders it, key and number, and its list and where it comes from."""
+    return ad.Array2u64(_joined(key, number), _joined(list_, source))
+
+
+def ordered_entries(
+    entries: UInt64, bounds: ListBounds, capacity: int, parts: int = 2, sizes: tuple[int, ...] | None = None
+) -> list[UInt32]:
+    """Number and source, or the first `parts` of these, [P] = [capacity], of entries that stand in their lists in any
+    order, each list ordered by key, then number; what stands behind the last list has no meaning. Not differentiable.
+
+    entries: of `empty_entries`, each an `entry_of`; no two of a list may have one key and number
+    sizes: of the runs that are made one from another, by default `SIZES`, `SIZES_OF_LONG` for lists that may be long
+    """
+    start, end = bounds.start, bounds.end
+    lists = dr.width(end)
+    if sizes is None:
+        sizes = SIZES_OF_LONG if capacity > ROOM * lists else SIZES
     entry = dr.arange(ad.UInt32, capacity)
-    listed = members < lists
-    place += dr.gather(ad.UInt32, start, members, listed)
-    entries = _packed(_joined(keys, numbers), _joined(members, entry), place, listed, capacity)
-    dr.eval(entries)
-
     live = entry < dr.gather(ad.UInt32, end, ad.UInt32(lists - 1))
     own, first, last = _own(entries, entry, live, start, end)
     chunk = _start_of_run(entry, first, sizes[0])
@@ -104,14 +132,14 @@ def ordered_lists(
     own, place, length = in_run(*sizes[-2:])
     is_long = live & (length > sizes[-1])
     in_runs = _packed(*own, place, is_long, capacity)
-    number, source = dr.empty(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
-    dr.scatter(number, dr.select(live, ad.UInt32(own[0]), 0), place)
-    dr.scatter(source, dr.select(live, ad.UInt32(own[1]), 0), place)
+    targets = [dr.empty(ad.UInt32, capacity) for _ in range(parts)]
+    for value, target in zip(own, targets, strict=False):
+        dr.scatter(target, dr.select(live, ad.UInt32(value), 0), place)
     some_long = dr.zeros(ad.UInt32, 1)
     dr.scatter(some_long, ad.UInt32(1), ad.UInt32(0), is_long)
-    dr.eval(number, source, in_runs, some_long)
-    _merge_runs((number, source), in_runs, some_long, start, end, sizes[-1])
-    return number, source, start, end, by_length
+    dr.eval(targets, in_runs, some_long)
+    _merge_runs(targets, in_runs, some_long, start, end, sizes[-1])
+    return targets
 
 
 def _class_of(lengths: UInt32) -> UInt32:
@@ -121,14 +149,11 @@ def _class_of(lengths: UInt32) -> UInt32:
 
 def _count_longer(counts: UInt32, class_: UInt32) -> UInt32:
     """How many lists are of longer classes, [N]. counts: lists of each class"""
-
-    def has_more(longer: UInt32, _sum: UInt32) -> Bool:
-        return longer < CLASSES
-
-    def add(longer: UInt32, total: UInt32) -> tuple[UInt32, UInt32]:
-        return longer + 1, total + dr.gather(ad.UInt32, counts, longer)
-
-    return dr.while_loop((class_ + 1, ad.UInt32(0)), has_more, add, mode="symbolic", label="longer lists")[1]
+    longer = ad.UInt32(0)
+    for four in range(CLASSES // 4):
+        for i, count in enumerate(dr.gather(ad.Array4u, counts, ad.UInt32(four))):
+            longer += dr.select(4 * four + i > class_, count, 0)
+    return longer
 
 
 def _start_of_run(entry: UInt32, first: UInt32, size: int) -> UInt32:
@@ -137,9 +162,9 @@ def _start_of_run(entry: UInt32, first: UInt32, size: int) -> UInt32:
 
 
 def _merge_runs(
-    targets: tuple[UInt32, UInt32], entries: UInt64, some_long: UInt32, start: UInt32, end: UInt32, run_size: int
+    targets: list[UInt32], entries: UInt64, some_long: UInt32, start: UInt32, end: UInt32, run_size: int
 ) -> None:
-    """Write numbers and sources of the lists longer than a run, whose runs are in order, in the order of the whole
+    """Write numbers, and sources, of the lists longer than a run, whose runs are in order, in the order of the whole
     list. One launch, which is over at once where there are none: some_long, of width 1, is 0."""
     lists = dr.width(end)
     total = dr.select(some_long > 0, dr.gather(ad.UInt32, end, ad.UInt32(lists - 1)), 0)
@@ -154,7 +179,7 @@ def _merge_runs(
         own = dr.gather(ad.Array2u64, entries, entry, is_long)
         run = _start_of_run(entry, first, run_size)
         others = _search_others(entries, own[0], run, first, dr.select(is_long, last, first), run_size)
-        for value, target in zip(own, targets, strict=True):
+        for value, target in zip(own, targets, strict=False):
             dr.scatter(target, ad.UInt32(value), first + (entry - run) + others, is_long)
         return (entry + MERGE_THREADS,)
 
@@ -168,9 +193,8 @@ def _joined(high: UInt32, low: UInt32) -> UInt64:
 
 
 def _packed(key: UInt64, source: UInt64, index: UInt32, active: Bool | bool, size: int) -> UInt64:
-    """A flat array [2 size] in which an entry's two numbers stand at its index, see `_own`; and some more behind it,
-    so that a turn of `_count_before` may read beyond the end."""
-    target = dr.empty(ad.UInt64, 2 * (size + COMPARED))
+    """Entries [2 size], see `_own`, in other places."""
+    target = empty_entries(size)
     dr.scatter(target, ad.Array2u64(key, source), index, active=active)
     return target
 
