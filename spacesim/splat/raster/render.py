@@ -28,7 +28,7 @@ from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals,
 
 PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
-MANY_PIXELS, MANY_SPLATS = 2**19, 2**14  #: from which on a picture on CUDA takes longer than to ask for it
+MANY_PIXELS, MANY_SPLATS = 2**19, 2**17  #: from which on a picture on CUDA takes longer than to ask for it
 
 
 @checked
