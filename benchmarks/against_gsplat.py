@@ -136,7 +136,8 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     """Train both, render the test views with both, compare with the truth over black."""
     dataset = read_dataset(data)
     refinement = replace(GSPLAT_DEFAULTS, refine_stop=iterations // 2)
-    config = with_options(preset("fast"), iterations=iterations, refinement=refinement)
+    classic = replace(preset("fast"), antialiased=False, surfels=False)
+    config = with_options(classic, iterations=iterations, refinement=refinement)
     truth = [(frame.camera, load_image(dataset, frame).over(np.zeros(3))) for frame in dataset.test]
 
     trainer = Trainer(dataset, config)

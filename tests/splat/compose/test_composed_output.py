@@ -187,6 +187,8 @@ def scene_file(tiny_run, tmp_path):
 
 
 def test_the_command(spacesim, scene_file, tmp_path):
+    config = tmp_path / "runs/tiny/config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "antialiased": False}))
     done = spacesim("compose", scene_file, "--out", tmp_path / "out", "--size", 20, "--ply", tmp_path / "pair.ply")
     assert done.code == 0, done.errors
     assert str(tmp_path / "out" / "sheet.png") in done.output
@@ -194,7 +196,6 @@ def test_the_command(spacesim, scene_file, tmp_path):
     assert set(np.unique(read_png(tmp_path / "out/id/0000.png"))) <= {0, 1, 2}
     assert (tmp_path / "pair.ply").stat().st_size > 1000
     assert not any("2D filter" in line for line in done.errors)
-    config = tmp_path / "runs/tiny/config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "antialiased": True}))
     done = spacesim("compose", scene_file, "--out", tmp_path / "out", "--size", 20, "--ply", tmp_path / "pair.ply")
     assert any(line.startswith("second: the run is antialiased") for line in done.errors)

@@ -93,7 +93,7 @@ def test_splats_in_the_half_stay_or_fade(small_dataset, tmp_path, key):
     dataset = replace(dataset, train=dataset.train[:1])
     view = TrainingViews(dataset, 0)[0]
     assert (view.opaque, view.valid is None) == (key == "mask_path", key == "silhouette_path")
-    trainer = Trainer(dataset, replace(preset("demo"), iterations=400, init_count=60))
+    trainer = Trainer(dataset, replace(preset("demo"), iterations=400, init_count=60, surfels=False))
     small = trainer.gaussians.to_numpy()
     trainer.gaussians = Gaussians.from_numpy({**small, "log_scales": np.full_like(small["log_scales"], -3.5)})
     rows = trainer.gaussians.rows()
