@@ -101,9 +101,7 @@ def test_ctrl_c_after_the_last_step_waits_for_the_model(tiny_data, tmp_path):
 
 
 def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path):
-    done = run(
-        "-c", PRESSED, "call:bin_counted:1:2", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE
-    )
+    done = run("-c", PRESSED, "call:counted:1:2", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, RESUMABLE)
     assert not list(tmp_path.rglob("*.safetensors"))
 

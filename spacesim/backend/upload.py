@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from spacesim.backend.arrays import Array3f, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.backend.selection import ad
 
 VECTOR = 64  # elements of the widest vector, and more
@@ -42,6 +42,16 @@ def upload_rows(rows: np.ndarray) -> Array3f:
 def held(number: int, role: str) -> UInt32:
     """A number that is no part of a kernel's text, of width 1; the same array each time, for to make one is a launch.
     role: what it is: arguments of a recording that have one value must be two arrays"""
-    array = dr.opaque(ad.UInt32, number)
+    return _held(ad.UInt32, number)
+
+
+@lru_cache(maxsize=256)
+def held_float(number: float, role: str) -> Float:
+    """The same of numbers that are not whole."""
+    return _held(ad.Float, number)
+
+
+def _held(kind: Any, number: float) -> Any:
+    array = dr.opaque(kind, number)
     dr.sync_thread()  # another thread may be the next to ask
     return array

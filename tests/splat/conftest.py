@@ -13,7 +13,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import intrinsics_of, read_dataset, write_points
 from spacesim.splat.raster.gaussians import SH_C0
-from spacesim.splat.raster.lists import bin as binning
+from spacesim.splat.raster.lists import capacity
 from spacesim.splat.reference.rasterizer import render_reference
 
 VIEWS, TESTS, SIZE = 8, 2, 32
@@ -22,7 +22,7 @@ VIEWS, TESTS, SIZE = 8, 2, 32
 @pytest.fixture(autouse=True)
 def forget_free_memory():
     """Of the test before."""
-    binning._found.clear()
+    capacity._found.clear()
 
 
 @pytest.fixture(scope="session")

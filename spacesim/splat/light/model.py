@@ -31,7 +31,7 @@ from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.light.surroundings import HeldSurroundings, Surfaces, Surroundings, look_around, ray_count
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.capacity import WAITING, PairCounts
 from spacesim.splat.raster.lists.pictures import computed
 
 log = logging.getLogger(__name__)
@@ -142,16 +142,14 @@ class LightModel:
         terms: SunEncoding = self._encodings(earth, *(float(value) for value in (ANY_SUN if sun is None else sun)))
         return terms
 
-    def shadows(
-        self, gaussians: Gaussians, sun: np.ndarray | None, make_lists: MakeLists = bin_splats
-    ) -> Shadows | None:
+    def shadows(self, gaussians: Gaussians, sun: np.ndarray | None, pairs: PairCounts = WAITING) -> Shadows | None:
         """Raw occlusion of each Gaussian, by one light camera in training and in pictures: the refinement corrects what
-        it was trained on. None for a model without shadows."""
+        it was trained on. None for a model without shadows. pairs: of the Sun's picture"""
         config = self.config.shadow
         if config is None:
             return None
         assert sun is not None, "shadows need the Sun"
-        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance, make_lists)
+        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance, pairs)
 
     def shade(
         self,
@@ -159,13 +157,13 @@ class LightModel:
         camera: Projection,
         sun: np.ndarray | None,
         picture: int | None = None,
-        make_lists: MakeLists = bin_splats,
+        pairs: PairCounts = WAITING,
         earth: Earth | None = None,
     ) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None:
         the field does not take it. picture: number of the training picture whose embedding the field reads; None: it
-        reads the mean one. make_lists: of the Sun's picture;  earth: see `encode_sun`"""
-        shadows = self.shadows(gaussians, sun, make_lists)
+        reads the mean one. pairs: of the Sun's picture;  earth: see `encode_sun`"""
+        shadows = self.shadows(gaussians, sun, pairs)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
         terms = self._with_embedding(self.encode_sun(sun, earth), embedding)
         inputs = self._inputs(gaussians, camera, terms, shadows, self.surroundings(gaussians))
@@ -219,27 +217,33 @@ class LightModel:
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for
         last and nothing has changed. embedding: as `shade_picture` takes it"""
+        return self._remembered(computed(lambda pairs: self._sunlight(gaussians, sun, embedding, pairs)))
+
+    def _remembered(self, last: _LastSunlight) -> Sunlight:
+        if last.read:
+            self._last_sunlight = last
+        return last.sunlight
+
+    def _sunlight(
+        self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None, pairs: PairCounts
+    ) -> _LastSunlight:
+        """What was asked for last, where that is asked for; `_remembered` keeps what holds."""
         if self.config.shadow is None and not self.config.bounce:
-            return Sunlight(None, [])
+            return _LastSunlight([], (), Sunlight(None, []))
         read = [*gaussians.rows(), *self.weights, *self.embeddings]
         asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
-        last = self._last_sunlight
-
-        def compute(make_lists: MakeLists = bin_splats) -> Sunlight:
-            return self.arriving(gaussians, sun, self._visibility(gaussians, sun, make_lists), embedding)
-
-        if dr.grad_enabled(read):
-            return compute()
-        if asked != last.asked or not _are_same(read, last.read):
-            last = self._last_sunlight = _LastSunlight(_kept(read), asked, computed(compute))
-        return last.sunlight
+        last, changes = self._last_sunlight, dr.grad_enabled(read)
+        if not changes and asked == last.asked and _are_same(read, last.read):
+            return last
+        sunlight = self.arriving(gaussians, sun, self._visibility(gaussians, sun, pairs), embedding)
+        return _LastSunlight([] if changes else _kept(read), asked, sunlight)
 
     def visibility(self, gaussians: Gaussians, sun: np.ndarray | None) -> Float | None:
         """Of `sunlight`, without what bounces."""
-        return computed(lambda make_lists: self._visibility(gaussians, sun, make_lists))
+        return computed(lambda pairs: self._visibility(gaussians, sun, pairs))
 
-    def _visibility(self, gaussians: Gaussians, sun: np.ndarray | None, make_lists: MakeLists) -> Float | None:
-        shadows = self.shadows(gaussians, sun, make_lists)
+    def _visibility(self, gaussians: Gaussians, sun: np.ndarray | None, pairs: PairCounts) -> Float | None:
+        shadows = self.shadows(gaussians, sun, pairs)
         if shadows is None:
             return None
         inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows, None)
@@ -277,7 +281,27 @@ class LightModel:
         `sunlight` or `arriving`;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
         the field's first layer makes of the features does not change with Sun or camera and stays for the next
         picture: as many numbers for each Gaussian as the layer has units."""
-        light = self.sunlight(gaussians, sun, embedding) if sunlight is None else sunlight
+        if sunlight is not None:
+            return self._shown(gaussians, camera, sun, sunlight, embedding, earth)
+
+        def under_sun(pairs: PairCounts) -> tuple[_LastSunlight, tuple[list[Float], Float | None]]:
+            last = self._sunlight(gaussians, sun, embedding, pairs)
+            return last, self._shown(gaussians, camera, sun, last.sunlight, embedding, earth)
+
+        last, shown = computed(under_sun)
+        self._remembered(last)
+        return shown
+
+    def _shown(
+        self,
+        gaussians: Gaussians,
+        camera: Projection,
+        sun: np.ndarray | None,
+        light: Sunlight,
+        embedding: np.ndarray | None,
+        earth: Earth | None,
+    ) -> tuple[list[Float], Float | None]:
+        """`shade_picture` by this light."""
         of_any_size = replace(camera, width=1, height=1)  # directions do not depend on it: one recording for all sizes
         batch = PaddedBatch.of(gaussians.count, still=True)
         cache = self._picture_cache(_features(gaussians), batch)

@@ -7,6 +7,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float, TensorXf, UInt32
+from spacesim.backend.upload import held
 from spacesim.splat.raster.lists.tiles import round_capacity
 
 CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
@@ -30,9 +31,7 @@ class PaddedBatch:
     @staticmethod
     def of(count: int, still: bool = False) -> "PaddedBatch":
         """For N = `count` Gaussians, at least one. still: of a model of constant size, with less padding."""
-        return PaddedBatch(
-            dr.opaque(ad.UInt32, count), (count // CHUNK + 1) * CHUNK if still else round_capacity(count)
-        )
+        return PaddedBatch(held(count, "columns"), (count // CHUNK + 1) * CHUNK if still else round_capacity(count))
 
     def repeat_last(self, values: Any) -> Any:
         """[N] to [M], an array or nested ones; the last is repeated."""

@@ -16,11 +16,12 @@ from spacesim.data.structure import checked
 from spacesim.splat.raster.blend import blend_planes, rasterize
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
-from spacesim.splat.raster.lists.bin import bin_splats, list_capacity, make_boxes, make_lists
+from spacesim.splat.raster.lists.bin import bin_splats, make_boxes, make_lists
 from spacesim.splat.raster.lists.boxes import Boxes, Grid
-from spacesim.splat.raster.lists.counting import Capacities, picture_lists
-from spacesim.splat.raster.lists.pictures import Kind, expected_capacity, observe
-from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
+from spacesim.splat.raster.lists.capacity import Capacities, Extent, list_capacity
+from spacesim.splat.raster.lists.counting import picture_lists
+from spacesim.splat.raster.lists.pictures import expected_capacity, observe
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.records import pack_records
@@ -116,32 +117,33 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
     blended, which takes a second recording, and that as long as some kernels. Where it is not, the host waits for it
     between two recordings. more: blended beside the outputs"""
     rows, camera, *_ = inputs
-    count, size, grid = dr.width(rows[0]), (camera.width, camera.height), Grid.of(camera.width, camera.height)
-    live, most = held(count, "splats"), round_capacity(count)
+    size, count = (camera.width, camera.height), dr.width(rows[0])
+    extent = Extent(count, *size, few_sizes=True)
+    grid, most = extent.grid, extent.most
     counts = tuple((name, PLANES[name]) for name in PLANES if name in inputs[3]) + _counts(more)
-    kind = Kind(most, *size, few_sizes=True)
-    expected = expected_capacity(kind)
+    expected = expected_capacity(extent)
     if expected is not None:
-        listing = live, held(expected, "pairs"), Capacities(expected, most), grid
+        listing = extent.live, held(expected, "pairs"), extent.capacities(expected), grid
         if size[0] * size[1] >= MANY_PIXELS and count >= MANY_SPLATS and can_read_async():
             listed = _list_splats(inputs, more, keeps_splats, *listing)
-            number = AsyncNumber(listed.sums, grid.tiles - 1)
+            number = AsyncNumber(listed.sums)
             planes = _blend_records(listed.records, listed.lists, counts, size, most)
             pairs = number.wait()
         else:
             listed, planes = _draw_at_once(inputs, more, keeps_splats, counts, *listing)
             pairs = int(listed.sums[grid.tiles - 1])
-        observe(kind, pairs)
+        observe(extent, pairs)
         if 0 < pairs <= expected:
             return listed.splats, listed.lists, planes
         del listed, planes  # frees memory for the next
-    prepared = _prepare_boxes(inputs, more, live, most, grid)
+    prepared = _prepare_boxes(inputs, more, extent.live, most, grid)
     pairs = prepared.boxes.pairs
-    capacity = list_capacity(pairs, size[0] * size[1], few_sizes=True)
-    observe(kind, pairs)
+    capacity = list_capacity(pairs, extent)
+    observe(extent, pairs)
     if capacity == 0:
         return prepared.splats, *_draw_in_stages(prepared.splats, prepared.footprints, prepared.groups, camera)
-    return prepared.splats, *_draw_boxes(prepared, counts, size, held(capacity, "pairs"), capacity, most, grid)
+    limit = held(capacity, "pairs")
+    return prepared.splats, *_draw_boxes(prepared, counts, size, limit, extent.capacities(capacity), grid)
 
 
 @dataclass
@@ -214,13 +216,12 @@ def _draw_boxes(
     counts: Counts,
     size: tuple[int, int],
     limit: UInt32,
-    capacity: int,
-    splat_capacity: int,
+    capacities: Capacities,
     grid: Grid,
 ) -> tuple[TileLists, Planes]:
-    """(the lists, of `capacity`; planes)."""
-    lists = make_lists(prepared.footprints, prepared.boxes, limit, capacity, splat_capacity, grid)
-    return lists, _blend_records(prepared.records, lists, counts, size, splat_capacity)
+    """(the lists; planes)."""
+    lists = make_lists(prepared.footprints, prepared.boxes, limit, capacities, grid)
+    return lists, _blend_records(prepared.records, lists, counts, size, capacities.splats)
 
 
 @recorded(elements=lambda _, _records, _lists, _counts, size, *_rest: size[0] * size[1])

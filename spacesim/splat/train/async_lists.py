@@ -1,8 +1,8 @@
 """Tile lists of training without a wait: with a capacity for as many pairs as a view is expected to have.
 
-The trainer asks for the lists of a view, computes with them, and before it keeps anything of that asks `all_fit`.
-Where a capacity was too small, lists were empty: it computes again, `synchronous`. So what is learned is the same to
-the bit as with `bin_splats`, and the host waits for a number that the device has long had.
+The trainer makes the lists of a view with what a view's `PairCounts` expect, computes with them, and before it keeps
+anything of that asks `all_fit`. Where a capacity was too small, lists were empty: it computes again, `synchronous`. So
+what is learned is the same to the bit as with waits, and the host waits for a number that the device has long had.
 """
 
 from collections import deque
@@ -11,10 +11,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from spacesim.backend import select
+from spacesim.backend.arrays import UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber, can_read_async
-from spacesim.splat.raster.lists.bin import LONG, bin_async, bin_counted, has_memory
-from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
-from spacesim.splat.raster.project import Footprints, Splats
+from spacesim.splat.raster.lists.boxes import Boxes
+from spacesim.splat.raster.lists.capacity import LONG, WAITING, Extent, has_memory
+from spacesim.splat.raster.lists.tiles import round_capacity
 
 HISTORY = 16  #: changes from a view's last visit to the next, of which the largest counts
 ENOUGH = 4  #: of them, from which on there is a forecast
@@ -65,46 +66,22 @@ class _PendingLists:
 
 
 class AsyncTileLists:
-    """Makes tile lists, and learns how long they are. backends: on which without a wait, where Dr.Jit can; on others
-    all of this is `bin_splats`."""
+    """Says for how many pairs a training's lists are made, and learns how many there are. backends: on which without a
+    wait, where Dr.Jit can; on others it waits for each count."""
 
     def __init__(self, backends: tuple[str, ...] = BACKENDS) -> None:
         self.is_async = select() in backends and can_read_async()
-        self._forecasts: dict[str, PairForecast] = {}
-        self._pending: list[_PendingLists] = []
+        self.forecasts: dict[str, PairForecast] = {}
+        self.pending: list[_PendingLists] = []
 
-    def make(
-        self,
-        kind: str,
-        view: Hashable,
-        splats: Splats,
-        footprints: Footprints,
-        width: int,
-        height: int,
-        training: bool = False,
-    ) -> TileLists:
-        """`bin_splats` of a view, without a wait where its number of pairs is known well enough. kind: of picture;
-        views of one kind are compared"""
-        forecast, view = self._forecasts.setdefault(kind, PairForecast()), (view, width, height)
-        capacity = forecast.capacity_for(view) if self.is_async else None
-        if capacity is not None and self._has_memory(capacity, width * height, training):
-            lists, number = bin_async(splats, footprints, width, height, capacity)
-            self._pending.append(_PendingLists(forecast, view, capacity, number))
-            return lists
-        lists, pairs = bin_counted(splats, footprints, width, height, training=training)
-        if self.is_async:
-            forecast.observe(view, pairs)
-        return lists
-
-    def _has_memory(self, capacity: int, pixels: int, training: bool) -> bool:
-        """Whether lists of a capacity fit into memory; where they do not, the pairs that there are may. Of long ones
-        the wait is short beside the work."""
-        return capacity <= LONG and has_memory(capacity, pixels, training)
+    def of_view(self, kind: str, view: Hashable) -> "ViewPairs":
+        """`PairCounts` of a view. kind: of picture; views of one kind are compared"""
+        return ViewPairs(self, self.forecasts.setdefault(kind, PairForecast()), view)
 
     def all_fit(self) -> bool:
-        """Whether all lists since the last time are those of `bin_splats`: the capacity was enough for all pairs, and
-        some were there. Waits until they have been counted, not for later work."""
-        pending, self._pending = self._pending, []
+        """Whether the capacity of all lists since the last time was enough for all pairs, and some were there. Waits
+        until they have been counted, not for later work."""
+        pending, self.pending = self.pending, []
         fits = True
         for one in pending:
             pairs = one.pairs.wait()
@@ -114,7 +91,7 @@ class AsyncTileLists:
 
     @contextmanager
     def synchronous(self) -> Iterator[None]:
-        """With waits, as `bin_splats`."""
+        """With waits."""
         before, self.is_async = self.is_async, False
         try:
             yield
@@ -123,5 +100,34 @@ class AsyncTileLists:
 
     def after_refinement(self) -> None:
         """Other Gaussians are there, or other opacities."""
-        for forecast in self._forecasts.values():
+        for forecast in self.forecasts.values():
             forecast.after_refinement()
+
+
+class ViewPairs:
+    """`PairCounts` of a view of a training."""
+
+    def __init__(self, lists: AsyncTileLists, forecast: PairForecast, view: Hashable) -> None:
+        self.lists, self.forecast, self.view = lists, forecast, view
+
+    def expected(self, extent: Extent) -> int | None:
+        """By its forecast, where that fits into memory; where it does not, the pairs that there are may. Of long lists
+        the wait is short beside the work."""
+        capacity = self.forecast.capacity_for(self._key(extent)) if self.lists.is_async else None
+        if capacity is None or capacity > LONG or not has_memory(capacity, extent):
+            return None
+        return capacity
+
+    def check(self, extent: Extent, pair_ends: UInt32 | UInt64, capacity: int) -> None:
+        """See `PairCounts`; `AsyncTileLists.all_fit` says it."""
+        self.lists.pending.append(_PendingLists(self.forecast, self._key(extent), capacity, AsyncNumber(pair_ends)))
+
+    def counted(self, extent: Extent, boxes: Boxes) -> int:
+        """See `PairCounts`."""
+        capacity = WAITING.counted(extent, boxes)
+        if self.lists.is_async:
+            self.forecast.observe(self._key(extent), boxes.pairs)
+        return capacity
+
+    def _key(self, extent: Extent) -> Hashable:
+        return self.view, extent.width, extent.height

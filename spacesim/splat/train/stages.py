@@ -6,12 +6,16 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
 from spacesim.learning.joined import Joined
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import make_boxes, make_lists
+from spacesim.splat.raster.lists.boxes import Boxes, Grid
+from spacesim.splat.raster.lists.capacity import Capacities
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.render import view_colors
 from spacesim.splat.raster.supersample import pixel_means
@@ -40,6 +44,62 @@ def project_views(
     color = [] if gaussians.features is not None else list(view_colors(gaussians, camera, degree))
     values = {"color": color, **shape_values(gaussians, splats, camera, shape, scale)}
     return splats, footprints, values, screen_radii(gaussians, splats, camera) if watched else None
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """What of a view does not change from step to step, see `project_views`."""
+
+    antialiased: bool  #: see `project`
+    shape: tuple[str, ...]  #: what is blended for the sake of the shape
+    scale: float  #: metres
+
+
+@dataclass
+class ViewSplats:
+    """A view's Gaussians, as far as they do not depend on its light."""
+
+    splats: Splats  #: on the screen
+    footprints: Footprints  #: of the splats
+    values: dict[str, list[Float]]  #: what is blended, by name
+    radii: Float | None  #: of `screen_radii`
+    boxes: Boxes  #: of the splats
+
+
+def find_view_boxes(
+    rows: list[Float],
+    camera: Pinhole,
+    degree: int,
+    settings: ViewSettings,
+    watched: bool,
+    count: UInt32,
+    capacity: int,
+    grid: Grid,
+) -> ViewSplats:
+    """`project_views`, and the tiles of the `count` splats, `capacity` at most."""
+    asked = settings.antialiased, settings.shape, settings.scale, watched
+    splats, footprints, values, radii = project_views(rows, camera, degree, *asked)
+    dr.schedule(splats, footprints, values, radii)
+    return ViewSplats(splats, footprints, values, radii, make_boxes(splats, footprints, count, capacity, grid))
+
+
+def list_view(
+    rows: list[Float],
+    camera: Pinhole,
+    degree: int,
+    settings: ViewSettings,
+    watched: bool,
+    count: UInt32,
+    limit: UInt32,
+    capacities: Capacities,
+    grid: Grid,
+) -> tuple[Splats, dict[str, list[Float]], Float | None, TileLists, UInt32 | UInt64]:
+    """Of `find_view_boxes` the splats, what is blended, and radii; lists of these capacities; the boxes' `pair_ends`.
+    The lists are empty where there are more pairs than `limit`."""
+    drawn = find_view_boxes(rows, camera, degree, settings, watched, count, capacities.splats, grid)
+    assert drawn.boxes.pair_ends is not None
+    lists = make_lists(drawn.footprints, drawn.boxes, limit, capacities, grid)
+    return drawn.splats, drawn.values, drawn.radii, lists, drawn.boxes.pair_ends
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:

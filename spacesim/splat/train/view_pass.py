@@ -9,12 +9,15 @@ from functools import lru_cache, partial
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
+from spacesim.backend.upload import held
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import lists_of_boxes
+from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
@@ -22,7 +25,15 @@ from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.train.async_lists import AsyncTileLists
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients
-from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss, project_views
+from spacesim.splat.train.stages import (
+    LossSettings,
+    TargetImage,
+    ViewSettings,
+    ViewSplats,
+    find_view_boxes,
+    list_view,
+    picture_loss,
+)
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
@@ -106,7 +117,8 @@ class ViewPass:
         )
         factors = [2**power for power in range(config.num_downscales + 1)]
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
-        self._project = recorded(project_views)
+        self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
+        self._settings = ViewSettings(config.antialiased, config.shape_terms, scale)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
@@ -123,21 +135,30 @@ class ViewPass:
     ) -> RenderedView:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
         see `RenderedView`;  watched: whether densification wants to know of it"""
-        config = self.config
-        camera = self._camera(view.camera, downscale)
-        splats, footprints, values, radii = self._project(
-            rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched
-        )
-        of_sun = partial(self.lists.make, "sun", view.index)
+        camera, pairs = self._camera(view.camera, downscale), self.lists.of_view("picture", view.index)
+        extent = Extent(gaussians.count, camera.width, camera.height, training=True)
+        asked, grid = (rows, camera, degree, self._settings, watched, extent.live), extent.grid
+        expected = pairs.expected(extent)
+        boxes: ViewSplats | None = None
+        if expected is None:
+            boxes = self._find_boxes(*asked, extent.most, grid)
+            splats, values, radii = boxes.splats, boxes.values, boxes.radii
+        else:
+            limit, capacities = held(expected, "pairs"), extent.capacities(expected)
+            splats, values, radii, lists, pair_ends = self._list(*asked, limit, capacities, grid)
+            pairs.check(extent, pair_ends, expected)
+        of_sun = self.lists.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
         if shading:
             values["color"] = shading.colors
-            if config.visibility_weight > 0 and shading.visibility is not None:
+            if self.config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
-        size = camera.width, camera.height
-        lists = self.lists.make("picture", view.index, splats, footprints, *size, training=True)
+        if boxes is not None:  # the host waits for as little as it can
+            capacity = pairs.counted(extent, boxes.boxes)
+            lists = lists_of_boxes(boxes.footprints, boxes.boxes, extent, capacity)
+            del boxes
         planes = [value for group in values.values() for value in group]
-        blended = forward(splats, planes, lists, *size, adjoint=True)
+        blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
 

@@ -524,13 +524,13 @@ def test_shadows_of_pictures_whose_lists_do_not_fit_are_the_same(monkeypatch, na
     wanted = [numbers(light.sunlight(splats, sun).visibility) for sun in suns]
     monkeypatch.setattr(picture_lists, "BACKENDS", ("cuda", "llvm"))
     made: list[int] = []
-    plain = picture_lists.bin_async
+    plain = picture_lists._PicturePairs.check
 
-    def spied(*arguments):
-        made.append(arguments[-1])
-        return plain(*arguments)
+    def spied(self, extent, boxes, capacity):
+        made.append(capacity)
+        plain(self, extent, boxes, capacity)
 
-    monkeypatch.setattr(picture_lists, "bin_async", spied)
+    monkeypatch.setattr(picture_lists._PicturePairs, "check", spied)
     light.sunlight(splats, suns[0])
     picture_lists._capacities.update(dict.fromkeys(picture_lists._capacities, 1))
     for sun, visibility in zip([*suns, *suns][1:], [*wanted, *wanted][1:], strict=True):

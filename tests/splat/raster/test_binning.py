@@ -8,13 +8,16 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import ad, recorded, recordings, select
+from spacesim.backend.readback import AsyncNumber
 from spacesim.backend.upload import held, upload
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import boxes, counting, tiles
+from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.lists.sort import empty_entries, entry_of, list_bounds, ordered_entries, segment_ids
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 
 pytestmark = pytest.mark.threads
@@ -169,18 +172,25 @@ def test_no_visible_splats_give_empty_lists(way):
 def test_lists_made_without_a_wait_are_the_same_where_they_fit(way, spare):
     """And empty where they do not; the capacity may be exact or much too large."""
     splats, footprints = projected(900, 70, 50)
-    known, pairs = binning.bin_counted(splats, footprints, 70, 50)
-    lists, number = binning.bin_async(splats, footprints, 70, 50, pairs + spare)
-    assert number.wait() == pairs > sum(map(len, listed(lists))) > 900
+    extent, known = Extent(900, 70, 50), binning.bin_splats(splats, footprints, 70, 50)
+
+    def made(hidden: bool, capacity: int) -> tuple[int, TileLists]:
+        """(how many pairs there are, lists with room for so many)."""
+        shown = footprints if not hidden else dataclasses.replace(footprints, visible=dr.opaque(ad.Bool, False, 900))
+        boxes = binning.make_boxes(splats, shown, extent.live, extent.most, extent.grid)
+        return AsyncNumber(boxes.pair_ends).wait(), binning.lists_of_boxes(shown, boxes, extent, capacity)
+
+    pairs, _ = made(False, 1)
+    found, lists = made(False, pairs + spare)
+    assert found == pairs > sum(map(len, listed(lists))) > 900
     assert listed(lists) == listed(known)
     np.testing.assert_array_equal(np.array(lists.slot_count), np.array(known.slot_count))
     for less in (1, pairs // 2, pairs - 1):
-        lists, number = binning.bin_async(splats, footprints, 70, 50, less)
-        assert number.wait() == pairs
+        found, lists = made(False, less)
+        assert found == pairs
         assert sum(map(len, listed(lists))) == np.array(lists.slot_count).sum() == 0
-    hidden = dataclasses.replace(footprints, visible=dr.opaque(ad.Bool, False, 900))
-    lists, number = binning.bin_async(splats, hidden, 70, 50, pairs)
-    assert number.wait() == sum(map(len, listed(lists))) == 0
+    found, lists = made(True, pairs)
+    assert found == sum(map(len, listed(lists))) == 0
 
 
 def assert_longest_first(order: np.ndarray, lengths) -> None:

@@ -16,12 +16,14 @@ from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
+from spacesim.splat.raster.lists import capacity
 from spacesim.splat.raster.lists import pictures as picture_lists
-from spacesim.splat.raster.lists.pictures import Kind, computed, expected_capacity, observe
-from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
+from spacesim.splat.raster.lists.capacity import Extent, PairCounts, rounded_pairs
+from spacesim.splat.raster.lists.pictures import computed, expected_capacity, observe
+from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.render import render
 
-KIND = Kind(2048, 64, 48)
+EXTENT = Extent(2000, 64, 48)
 
 
 @pytest.fixture(autouse=True, params=["cuda", "llvm", "cuda, many pixels"])
@@ -82,20 +84,20 @@ def test_pictures_near_and_far_and_of_nothing(monkeypatch):
     gaussians = Gaussians.from_numpy(random_splats(1500, 0, degree=1))
     views = [camera(3), camera(3.01), camera(1.2), away(), away(), camera(9), camera(1.2), camera(1.2)]
     expected, given = [], []
-    monkeypatch.setattr("spacesim.splat.raster.render.expected_capacity", lambda kind: None)
+    monkeypatch.setattr("spacesim.splat.raster.render.expected_capacity", lambda extent: None)
     for view in views:
         expected.append(drawn(gaussians, view))
     picture_lists._capacities.clear()
 
-    def spy(kind: Kind) -> int | None:
-        given.append(expected_capacity(kind))
+    def spy(extent: Extent) -> int | None:
+        given.append(expected_capacity(extent))
         return given[-1]
 
     monkeypatch.setattr("spacesim.splat.raster.render.expected_capacity", spy)
     for view, pictures in zip(views, expected, strict=True):
         for found, wanted in zip(drawn(gaussians, view), pictures, strict=True):
             np.testing.assert_array_equal(found, wanted)
-    assert [capacity is None for capacity in given] == [True, False, False, False, True, True, False, False]
+    assert [one is None for one in given] == [True, False, False, False, True, True, False, False]
     assert given[2] < given[7]  # the first near picture did not fit
     assert len(np.unique(expected[0][1])) > 100
 
@@ -106,10 +108,16 @@ def test_what_is_computed_with_lists_is_computed_again_where_they_do_not_fit():
 
     def pairs_of(distance: float) -> int:
         splats, footprints = project(gaussians, camera(distance))
+        extent = Extent(1500, 64, 48)
 
-        def compute(make_lists: binning.MakeLists) -> int:
+        def compute(pairs: PairCounts) -> int:
             calls.append(distance)
-            return make_lists(splats, footprints, 64, 48).pairs
+            boxes = binning.make_boxes(splats, footprints, extent.live, extent.most, extent.grid)
+            expected = pairs.expected(extent)
+            if expected is not None:
+                pairs.check(extent, boxes.pair_ends, expected)
+            enough = pairs.counted(extent, boxes) if expected is None else expected
+            return binning.lists_of_boxes(footprints, boxes, extent, enough).pairs
 
         return computed(compute)
 
@@ -117,27 +125,25 @@ def test_what_is_computed_with_lists_is_computed_again_where_they_do_not_fit():
     assert calls == [3, 3, 1.2, 1.2, 1.2, 3]
     for distance, pairs in zip((3, 3, 1.2, 1.2, 3), found, strict=True):
         assert pairs == binning.bin_splats(*project(gaussians, camera(distance)), 64, 48).pairs > 1500
-    nothing = dr.zeros(ad.Float, 0)
-    none = Splats(*[nothing] * 7), Footprints(nothing, nothing, dr.zeros(ad.Bool, 0), dr.zeros(ad.UInt32, 0))
-    assert computed(lambda make_lists: make_lists(*none, 64, 48).pairs) == 0
+    assert computed(lambda pairs: pairs.expected(Extent(0, 64, 48))) is None
 
 
-def seen(kind: Kind, pairs: int) -> int | None:
-    observe(kind, pairs)
-    return expected_capacity(kind)
+def seen(extent: Extent, pairs: int) -> int | None:
+    observe(extent, pairs)
+    return expected_capacity(extent)
 
 
 def test_a_capacity_is_kept_while_it_is_enough_and_not_much_too_large():
-    capacity = seen(KIND, 100_000)
-    assert capacity == binning.rounded_pairs(100_000, few_sizes=False) > 100_000
-    assert seen(KIND, 80_000) == capacity
-    assert seen(KIND, 40_000) == binning.rounded_pairs(40_000, few_sizes=False) < capacity
-    assert expected_capacity(Kind(2048, 64, 50)) is None
-    assert seen(KIND, 0) is None
-    assert seen(KIND, picture_lists.LONG) is None
-    used = Kind(1024, 10**6, 1)
+    kept = seen(EXTENT, 100_000)
+    assert kept == rounded_pairs(100_000, few_sizes=False) > 100_000
+    assert seen(EXTENT, 80_000) == kept
+    assert seen(EXTENT, 40_000) == rounded_pairs(40_000, few_sizes=False) < kept
+    assert expected_capacity(Extent(2000, 64, 50)) is None
+    assert seen(EXTENT, 0) is None
+    assert seen(EXTENT, picture_lists.LONG) is None
+    used = Extent(1000, 10**6, 1)
     for i in range(3 * picture_lists.KINDS):
-        observe(Kind(1024, i, 1), 5)
+        observe(Extent(1000, i, 1), 5)
         observe(used, 5)
     assert len(picture_lists._capacities) == picture_lists.KINDS
     assert expected_capacity(used) is not None
@@ -149,18 +155,18 @@ def test_threads_observe_pictures_of_many_kinds():
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            kinds = [Kind(1024, 1 + i % 150, 1) for i in range(8000)]
-            assert len(list(pool.map(seen, kinds, itertools.repeat(5)))) == 8000
+            extents = [Extent(1000, 1 + i % 150, 1) for i in range(8000)]
+            assert len(list(pool.map(seen, extents, itertools.repeat(5)))) == 8000
     finally:
         sys.setswitchinterval(before)
     assert len(picture_lists._capacities) == picture_lists.KINDS
 
 
 def test_a_capacity_that_finds_no_place_is_not_expected(monkeypatch):
-    observe(KIND, 100_000)
-    monkeypatch.setattr(binning, "check_memory", refuse)
-    assert expected_capacity(KIND) is None
-    observe(KIND, 120_000)  # what is drawn already needs no place
+    observe(EXTENT, 100_000)
+    monkeypatch.setattr(capacity, "check_memory", refuse)
+    assert expected_capacity(EXTENT) is None
+    observe(EXTENT, 120_000)  # what is drawn already needs no place
 
 
 def refuse(*_: object, **__: object) -> None:
@@ -168,6 +174,6 @@ def refuse(*_: object, **__: object) -> None:
 
 
 def test_a_backend_whose_host_computes_waits(monkeypatch):
-    observe(KIND, 100_000)
+    observe(EXTENT, 100_000)
     monkeypatch.setattr(picture_lists, "BACKENDS", ())
-    assert expected_capacity(KIND) is None
+    assert expected_capacity(EXTENT) is None

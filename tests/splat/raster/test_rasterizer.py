@@ -17,7 +17,7 @@ from spacesim.splat.raster import records, walks
 from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.lists import bin as binning
-from spacesim.splat.raster.lists import boxes, tiles
+from spacesim.splat.raster.lists import boxes, capacity, tiles
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.raster.render import render
 from spacesim.splat.reference.rasterizer import real_spherical_harmonics, render_reference
@@ -273,10 +273,10 @@ def test_recordings_serve_models_of_any_size():
 def test_pictures_have_lists_of_few_sizes():
     """Two from one power of two to the next; a model that is seen from all over then has few recordings."""
     counts = range(2**13, 2**17, 61)
-    sizes = {tiles.round_capacity(count, binning.FEW) for count in counts}
+    sizes = {tiles.round_capacity(count, capacity.FEW) for count in counts}
     assert len(sizes) <= 9
     assert len({tiles.round_capacity(count) for count in counts}) > 30
-    assert all(count < tiles.round_capacity(count, binning.FEW) <= 1.5 * count + 1 for count in counts)
+    assert all(count < tiles.round_capacity(count, capacity.FEW) <= 1.5 * count + 1 for count in counts)
     arrays = random_splats(600, seed=5, degree=0)
     splats, footprints = project(Gaussians.from_numpy(arrays), Pinhole.of(camera(64, 48)))
     few, many = (binning.bin_splats(splats, footprints, 64, 48, few_sizes=flag) for flag in (True, False))
@@ -299,7 +299,7 @@ def test_a_recording_of_as_many_splats_as_its_capacity_serves_fewer(first):
 @pytest.mark.parametrize(("count", "sentence"), [(20_000, "GB are free"), (150_000, "can be sorted")])
 def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatch):
     """Splats that cover all tiles of a large picture."""
-    monkeypatch.setattr(binning, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(capacity, "free_memory", lambda _: 10**9)
     arrays = random_splats(count, degree=0)
     arrays["log_scales"][:] = 3.0
     arrays["logit_opacities"][:] = 5.0
@@ -309,7 +309,7 @@ def test_more_pairs_than_memory_holds_are_a_sentence(count, sentence, monkeypatc
 
 def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
     """Also of a single splat, and of none in sight."""
-    monkeypatch.setattr(binning, "free_memory", lambda _: 10**9)
+    monkeypatch.setattr(capacity, "free_memory", lambda _: 10**9)
     arrays, view = random_splats(1), camera(4096, 4096)
     with pytest.raises(WorkError, match=r"on 1.68e\+07 pixels need about 1.43 GB of memory, 1 GB are free"):
         render(Gaussians.from_numpy(arrays), Pinhole.of(view))
@@ -319,29 +319,29 @@ def test_a_picture_larger_than_memory_is_a_sentence(monkeypatch):
 
 
 def test_a_training_step_needs_more_than_a_picture(monkeypatch, small_dataset):
-    monkeypatch.setattr(binning, "free_memory", lambda _: 2 * 10**9)
+    monkeypatch.setattr(capacity, "free_memory", lambda _: 2 * 10**9)
     view = camera(4096, 4096)
     splats, footprints = project(Gaussians.from_numpy(random_splats(1)), Pinhole.of(view))
     assert binning.bin_splats(splats, footprints, 4096, 4096).pairs > 0
-    needed = {"cuda": "2.7", "llvm": "4.71"}[binning.select()]
+    needed = {"cuda": "2.7", "llvm": "4.7"}[capacity.select()]
     with pytest.raises(WorkError, match=rf"need about {needed} GB of memory, 2 GB are free"):
-        binning.bin_splats(splats, footprints, 4096, 4096, training=True)
-    monkeypatch.setattr(binning, "TRAINING_BYTES", dict.fromkeys(("cuda", "llvm"), (0, 10**7)))
+        capacity.list_capacity(1, capacity.Extent(1, 4096, 4096, training=True))
+    monkeypatch.setattr(capacity, "TRAINING_BYTES", dict.fromkeys(("cuda", "llvm"), (0, 10**7)))
     with pytest.raises(WorkError, match="2 GB are free"):
         Trainer(small_dataset, TrainConfig()).step()
 
 
 def test_memory_that_was_free_a_moment_ago_is_not_asked_for_again(monkeypatch):
-    asked, now = [], [100.0]
-    monkeypatch.setattr(binning, "free_memory", lambda needed: asked.append(needed) or 10**9)
-    monkeypatch.setattr(binning.time, "monotonic", lambda: now[0])
+    asked, now, extent = [], [100.0], capacity.Extent(1, 0, 0)
+    monkeypatch.setattr(capacity, "free_memory", lambda needed: asked.append(needed) or 10**9)
+    monkeypatch.setattr(capacity.time, "monotonic", lambda: now[0])
     for pairs in (4 * 10**6, 4 * 10**6, 3 * 10**6, 5 * 10**6, 10**6):
-        binning.check_memory(pairs, 0, training=False)
+        capacity.check_memory(pairs, extent)
     assert asked == [8 * 10**8, 10**9]
     with pytest.raises(WorkError, match=r"need about 1\.2 GB"):
-        binning.check_memory(6 * 10**6, 0, training=False)
-    now[0] += binning.BELIEVED
-    binning.check_memory(4 * 10**6, 0, training=False)
+        capacity.check_memory(6 * 10**6, extent)
+    now[0] += capacity.BELIEVED
+    capacity.check_memory(4 * 10**6, extent)
     assert asked == [8 * 10**8, 10**9, 12 * 10**8, 8 * 10**8]
 
 

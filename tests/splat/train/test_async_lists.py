@@ -11,8 +11,10 @@ from spacesim.backend import ad, select
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.bin import make_boxes
+from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.lists.tiles import round_capacity
-from spacesim.splat.raster.project import Pinhole, project
+from spacesim.splat.raster.project import Footprints, Pinhole, project
 from spacesim.splat.train import async_lists
 from spacesim.splat.train.async_lists import ENOUGH, HISTORY, AsyncTileLists, PairForecast
 from spacesim.splat.train.config import TrainConfig, preset
@@ -73,15 +75,9 @@ class Counted(AsyncTileLists):
         super().__init__(backends)
         self.made, self.again, self.kinds = 0, 0, set()
 
-    def make(self, kind, *arguments, **named):
-        before = len(self._pending)
-        lists = super().make(kind, *arguments, **named)
-        if len(self._pending) > before:
-            self.made += 1
-            self.kinds.add(kind)
-        return lists
-
     def all_fit(self):
+        self.made += len(self.pending)
+        self.kinds |= {kind for kind, one in self.forecasts.items() if any(p.forecast is one for p in self.pending)}
         fits = super().all_fit()
         self.again += not fits
         return fits
@@ -171,16 +167,25 @@ def test_an_emptied_picture_has_an_empty_list():
     camera = Camera.from_fov(look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0]), 40, 40, 40)
     splats, boxes = project(Gaussians.from_numpy(random_splats(50, 0, degree=0)), Pinhole.of(camera))
     dr.eval(splats, boxes)
-    lists = AsyncTileLists((select(),))
+    lists, extent = AsyncTileLists((select(),)), Extent(50, 40, 40)
+
+    def capacity(view: int, footprints: Footprints) -> int:
+        boxes = make_boxes(splats, footprints, extent.live, extent.most, extent.grid)
+        pairs = lists.of_view("picture", view)
+        if (expected := pairs.expected(extent)) is None:
+            return pairs.counted(extent, boxes)
+        pairs.check(extent, boxes.pair_ends, expected)
+        return expected
+
     for view in [*range(ENOUGH + 1)] * 2:
-        shown = lists.make("picture", view, splats, boxes, 40, 40)
+        assert capacity(view, boxes) > 0
+    assert len(lists.pending) > 0
     assert lists.all_fit()
-    assert shown.pairs > 0
     hidden = replace(boxes, visible=dr.opaque(ad.Bool, False, 50))
-    assert lists.make("picture", 0, splats, hidden, 40, 40).capacity > 0
+    assert capacity(0, hidden) > 0
     assert not lists.all_fit()
     with lists.synchronous():
-        assert lists.make("picture", 0, splats, hidden, 40, 40).capacity == 0
+        assert capacity(0, hidden) == 0
     assert lists.all_fit()
 
 

@@ -8,17 +8,19 @@ import drjit as dr
 from numpy.typing import ArrayLike
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32, UInt64
+from spacesim.backend.upload import held, held_float
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.bias import Bias, grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.light.shadow.light_camera import fit_camera
 from spacesim.splat.light.shadow.mapping import (
+    LEAST_SOFTNESS,
     MappingConfig,
     MapReceivers,
     occlusion_by_mapping,
-    occlusion_in_picture,
+    occlusion_in_map,
     project_casters,
 )
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
@@ -27,12 +29,14 @@ from spacesim.splat.light.shadow.splatting import (
     LEAST_BETA,
     Receivers,
     make_events,
-    occlude,
     occlusion_by_splatting,
+    occlusion_in_events,
 )
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.bin import make_boxes, make_lists
+from spacesim.splat.raster.lists.boxes import Boxes, Grid
+from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent, PairCounts
 from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
 
@@ -104,20 +108,37 @@ class Shadows:
 
 
 def cast_shadows(
-    gaussians: Gaussians, light: Float, config: ShadowConfig, distance: float, make_lists: MakeLists = bin_splats
+    gaussians: Gaussians, light: Float, config: ShadowConfig, distance: float, pairs: PairCounts = WAITING
 ) -> Shadows:
     """Raw occlusion (4.6, 4.10) of N Gaussians by each other, with one light camera. light: Float [9] of `light_rows`;
-    distance: metres, of the farthest training camera;  make_lists: of the light's picture"""
-    rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    capacity = round_capacity(gaussians.count)
-    sunlit = _Sunlit(rows, light, *_numbers(config), config.size, config.crop, config.grazing, capacity)
-    if isinstance(config.method, MappingConfig):
-        view, splats, boxes = _light_splats(sunlit, config.method.antialiased)
-        receivers = MapReceivers.of(rows, view.points, view.bias.bias, config.softness * distance)
-        occlusion = occlusion_in_picture(receivers, (splats, boxes), view.camera, config.method, [], make_lists)
+    distance: metres, of the farthest training camera;  pairs: of the light's picture"""
+    softness = held_float(max(config.softness * distance, LEAST_SOFTNESS), "softness")
+    sunlit = _Sunlit(
+        [dr.detach(row) for row in gaussians.shape_rows()],
+        light,
+        *_numbers(config),
+        softness,
+        held(gaussians.count, "Gaussians"),
+        config.method,
+        config.size,
+        config.crop,
+        config.grazing,
+        round_capacity(gaussians.count),
+    )
+    splats = gaussians.count if isinstance(config.method, MappingConfig) else 2 * sunlit.capacity
+    extent = Extent(splats, config.size, config.size)
+    expected = pairs.expected(extent)
+    if expected is not None:
+        limit, capacities = held(expected, "pairs"), extent.capacities(expected)
+        view, occlusion, pair_ends = _cast_at_once(sunlit, extent.live, limit, capacities, extent.grid)
+        pairs.check(extent, pair_ends, expected)
     else:
-        view, events, boxes = _light_events(sunlit, _beta_min(config), dr.opaque(ad.UInt32, gaussians.count))
-        occlusion = occlude(events, boxes, view.camera, gaussians.count, make_lists)
+        seen = _seen_by_sun(sunlit, extent.live, extent.most, extent.grid)
+        view, capacity = seen.view, pairs.counted(extent, seen.boxes)
+        if capacity:
+            occlusion = _cast(sunlit, seen, held(capacity, "pairs"), extent.capacities(capacity), extent.grid)
+        else:
+            occlusion = dr.opaque(ad.Float, 0, gaussians.count)
     return Shadows(occlusion, view.camera, view.bias, view.points)
 
 
@@ -165,7 +186,7 @@ def cast_cross_shadows(
 
 def _numbers(config: ShadowConfig) -> tuple[Float, Float]:
     """Bias and reach as kernels read them."""
-    return dr.opaque(ad.Float, config.bias), dr.opaque(ad.Float, config.reach)
+    return held_float(config.bias, "bias"), held_float(config.reach, "reach")
 
 
 def _beta_min(config: ShadowConfig) -> float:
@@ -180,6 +201,9 @@ class _Sunlit:
     light: Float  #: of `light_rows`
     strength: Float  #: of the bias
     reach: Float  #: of the grazing bias
+    softness: Float  #: metres
+    count: UInt32  #: N
+    method: MappingConfig | SplattingConfig
     size: int  #: of the light's picture
     crop: bool
     grazing: str
@@ -195,27 +219,55 @@ class _LightView:
     points: Array3f | None  #: where receivers are tested, None for their centres
 
 
+@dataclass
+class _SunPicture:
+    """What the Sun's picture is drawn of."""
+
+    view: _LightView
+    splats: Splats  #: of `project_casters`, or of `make_events`
+    footprints: Footprints  #: of the splats
+    boxes: Boxes  #: of the splats
+
+
 @recorded
-def _light_view(sunlit: _Sunlit) -> _LightView:
-    rows = sunlit.rows
+def _seen_by_sun(sunlit: _Sunlit, live: UInt32, most: int, grid: Grid) -> _SunPicture:
+    """live: how many splats there are, `most` at most"""
+    rows, method = sunlit.rows, sunlit.method
     camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.capacity)
-    return _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
+    view = _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
+    if isinstance(method, MappingConfig):
+        splats, footprints = project_casters(rows, camera, method.antialiased)
+        dr.schedule(view, splats, footprints)
+    else:
+        dr.eval(view)
+        receivers = Receivers(view.bias.bias, view.points, method.beta_min)
+        splats, footprints = make_events(rows, receivers, camera, False, sunlit.count, sunlit.capacity)
+        dr.schedule(splats, footprints)
+    return _SunPicture(view, splats, footprints, make_boxes(splats, footprints, live, most, grid))
 
 
 @recorded
-def _light_splats(sunlit: _Sunlit, antialiased: bool) -> tuple[_LightView, Splats, Footprints]:
-    """`_light_view` and `project_casters`."""
-    view = _light_view(sunlit)
-    return view, *project_casters(sunlit.rows, view.camera, antialiased)
+def _cast(sunlit: _Sunlit, seen: _SunPicture, limit: UInt32, capacities: Capacities, grid: Grid) -> Float:
+    """Occlusion [N] by lists of these capacities: 0 where there are more pairs than `limit`."""
+    view, rows, method = seen.view, sunlit.rows, sunlit.method
+    lists = make_lists(seen.footprints, seen.boxes, limit, capacities, grid)
+    if isinstance(method, MappingConfig):
+        receivers = MapReceivers(rows, view.points, view.bias.bias, sunlit.softness)
+        return occlusion_in_map(receivers, [], seen.splats, lists, view.camera, method, capacities.splats)
+    occlusion = occlusion_in_events(seen.splats, lists, (sunlit.size, sunlit.size), sunlit.capacity)
+    dr.eval(occlusion)
+    index = dr.arange(ad.UInt32, dr.width(rows[0]))
+    return dr.select(index < sunlit.count, dr.gather(ad.Float, occlusion, index), rows[0])
 
 
 @recorded
-def _light_events(sunlit: _Sunlit, beta_min: float, count: UInt32) -> tuple[_LightView, Splats, Footprints]:
-    """`_light_view` and `make_events`. count: N"""
-    view = _light_view(sunlit)
-    dr.eval(view)
-    receivers = Receivers(view.bias.bias, view.points, beta_min)
-    return view, *make_events(sunlit.rows, receivers, view.camera, False, count, sunlit.capacity)
+def _cast_at_once(
+    sunlit: _Sunlit, live: UInt32, limit: UInt32, capacities: Capacities, grid: Grid
+) -> tuple[_LightView, Float, UInt32 | UInt64]:
+    """`_seen_by_sun` and `_cast`; the `pair_ends` of the boxes."""
+    seen = _seen_by_sun(sunlit, live, capacities.splats, grid)
+    assert seen.boxes.pair_ends is not None
+    return seen.view, _cast(sunlit, seen, limit, capacities, grid), seen.boxes.pair_ends
 
 
 @recorded

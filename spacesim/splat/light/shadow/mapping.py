@@ -19,13 +19,14 @@ from spacesim.splat.light.shadow.light_camera import drawable_mask
 from spacesim.splat.raster.blend import blend_lists
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats, project
 from spacesim.splat.raster.surface import NONE, surface_depth, walk
 
 Filter = Literal["bilinear", "percentage-closer", "variance", "median"]
 FILTERS: tuple[Filter, ...] = get_args(Filter)
+LEAST_SOFTNESS = 1e-20  #: metres
 MAX_WINDOW = 16  #: pixels to either side that a filter may read
 
 
@@ -80,7 +81,6 @@ def occlusion_by_mapping(
     config: MappingConfig | None = None,
     points: Array3f | None = None,
     casters: Gaussians | None = None,
-    make_lists: MakeLists = bin_splats,
 ) -> Float:
     """Float [N] in [0, 1]: raw occlusion by the depth test (thesis 4.4 to 4.6), 0 = sees the Sun. Detached.
 
@@ -97,9 +97,15 @@ def occlusion_by_mapping(
         return dr.zeros(ad.Float, 0)
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
     casting = [] if casters is None else [dr.detach(row) for row in casters.shape_rows()]
-    drawn = project_casters(casting or rows, camera, config.antialiased)
-    receivers = MapReceivers.of(rows, points, bias, softness)
-    return occlusion_in_picture(receivers, drawn, camera, config, casting, make_lists)
+    splats, footprints = project_casters(casting or rows, camera, config.antialiased)
+    lists = bin_splats(splats, footprints, camera.width, camera.height)
+    if lists.capacity == 0:
+        return dr.opaque(ad.Float, 0, gaussians.count)
+    points, bias = None if points is None else dr.detach(points), dr.detach(bias)
+    receivers = MapReceivers(rows, points, bias, dr.opaque(ad.Float, max(softness, LEAST_SOFTNESS)))
+    surfaces = casting if config.filter == "median" else []  # other filters read the splats alone
+    capacity = round_capacity(dr.width(splats.x))
+    return occlusion_in_map(receivers, surfaces, splats, lists, camera, config, capacity)
 
 
 @dataclass
@@ -111,33 +117,9 @@ class MapReceivers:
     bias: Float  #: [N], metres
     softness: Float  #: metres
 
-    @staticmethod
-    def of(rows: list[Float], points: Array3f | None, bias: Float, softness: float) -> "MapReceivers":
-        """See `occlusion_by_mapping`."""
-        points, bias = None if points is None else dr.detach(points), dr.detach(bias)
-        return MapReceivers(rows, points, bias, dr.opaque(ad.Float, max(softness, 1e-20)))
-
-
-def occlusion_in_picture(
-    receivers: MapReceivers,
-    drawn: tuple[Splats, Footprints],
-    camera: Orthographic,
-    config: MappingConfig,
-    casting: list[Float],
-    make_lists: MakeLists,
-) -> Float:
-    """`occlusion_by_mapping` by what `project_casters` has drawn. casting: rows of the casters, none: those of the
-    receivers"""
-    splats, footprints = drawn
-    lists = make_lists(splats, footprints, camera.width, camera.height)
-    if lists.capacity == 0:
-        return dr.opaque(ad.Float, 0, dr.width(receivers.rows[0]))
-    surfaces = casting if config.filter == "median" else []  # other filters read the splats alone
-    return _tested(receivers, surfaces, splats, lists, camera, config, round_capacity(dr.width(splats.x)))
-
 
 @recorded
-def _tested(
+def occlusion_in_map(
     test: MapReceivers,
     casting: list[Float],
     splats: Splats,
@@ -146,8 +128,8 @@ def _tested(
     config: MappingConfig,
     capacity: int,
 ) -> Float:
-    """Draws the light's picture and looks the receivers up in it. casting: rows of what the splats are; none: those of
-    the receivers"""
+    """[N]: draws the light's picture by its lists and looks the receivers up in it. casting: rows of what the splats
+    are; none: those of the receivers;  capacity: length of the splats' arrays"""
     if config.filter == "median":
         light = _median_shadow_map(Gaussians.from_rows(casting or test.rows), splats, lists, camera, capacity)
     else:
@@ -238,7 +220,7 @@ class SunView:
         if lists.capacity == 0:
             return None
         light = _drawn(splats, lists, camera, config.filter == "variance", round_capacity(dr.width(splats.x)))
-        return SunView(light, camera, dr.opaque(ad.Float, max(softness, 1e-20)), config)
+        return SunView(light, camera, dr.opaque(ad.Float, max(softness, LEAST_SOFTNESS)), config)
 
     def visibility(self, points: Array3f) -> Float:
         """[N] share of the Sun's light that reaches points [3, N], world, metres; 1 outside of the image."""

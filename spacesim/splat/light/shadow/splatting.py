@@ -15,7 +15,7 @@ from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
 from spacesim.splat.raster.adjoint import reduce_mode
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.lists.bin import MakeLists, bin_splats
+from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
 from spacesim.splat.raster.records import (
@@ -41,7 +41,6 @@ def occlusion_by_splatting(
     antialiased: bool = False,
     receives: Bool | None = None,
     beta_min: float = BETA_MIN,
-    make_lists: MakeLists = bin_splats,
 ) -> Float:
     """Float [N] in [0, 1], detached: the share of sunlight that is blocked before it reaches each Gaussian.
 
@@ -71,16 +70,10 @@ def occlusion_by_splatting(
     live, capacity = dr.opaque(ad.UInt32, count), round_capacity(count)
     rows = [dr.detach(row) for row in gaussians.shape_rows()]
     events, boxes = make_events(rows, receivers, camera, antialiased, live, capacity)
-    return occlude(events, boxes, camera, count, make_lists)
-
-
-def occlude(events: Splats, boxes: Footprints, camera: Orthographic, count: int, make_lists: MakeLists) -> Float:
-    """Float [N]: occlusion of the N = `count` Gaussians of `make_events`."""
-    size = camera.width, camera.height
-    lists = make_lists(events, boxes, *size)
+    lists = bin_splats(events, boxes, camera.width, camera.height)
     if lists.capacity == 0:
         return dr.opaque(ad.Float, 0, count)
-    occlusion = _walk(events, lists, size, round_capacity(count))
+    occlusion = occlusion_in_events(events, lists, (camera.width, camera.height), capacity)
     return dr.gather(ad.Float, occlusion, dr.arange(ad.UInt32, count))
 
 
@@ -135,8 +128,8 @@ def _depth(means: Array3f, camera: Orthographic) -> Float:
 
 
 @recorded
-def _walk(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int) -> Float:
-    """[capacity]: what each receiver has lost. One thread holds a block of a tile's pixels."""
+def occlusion_in_events(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int) -> Float:
+    """[capacity]: what each receiver of `make_events` has lost. One thread holds a block of a tile's pixels."""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
     records = list_records(pack_records(events, [], 2 * capacity), lists, 2 * capacity)

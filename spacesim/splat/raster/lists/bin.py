@@ -9,21 +9,18 @@ in no list. How the lists are put in order depends on the backend, the order doe
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 
-from spacesim.backend import ad, free_memory, recorded, select
+from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import UInt32
-from spacesim.backend.readback import AsyncNumber
 from spacesim.backend.upload import held
-from spacesim.data.errors import WorkError
 from spacesim.splat.raster.lists.boxes import Boxes, Grid, find_boxes, packed, tile_of_pair
-from spacesim.splat.raster.lists.counting import Capacities, count_boxes, count_lists
+from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent
+from spacesim.splat.raster.lists.counting import count_boxes, count_lists
 from spacesim.splat.raster.lists.sort import segment_ids
-from spacesim.splat.raster.lists.tiles import STEPS, TileLists, TileShape, round_capacity
+from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import Footprints, Splats
 from spacesim.splat.raster.records import load
 
@@ -31,76 +28,29 @@ DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
 PACKET = 16  #: SIMD lanes that run together on a CPU with AVX-512; elsewhere fewer
 MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
-FEW = 2  #: sizes of the lists of pictures from one power of two to the next
-LONG = 2**22  #: pairs from which on lists of pictures have no more capacity than others: a gigabyte
-MAX_PAIRS = {"cuda": 0.9 * 2**30, "llvm": 0.9 * 2**29}  #: records hold four or eight numbers a pair, arrays 2^32
-PICTURE_BYTES = 200, 85  #: a pair (lists, sorting, blending), a pixel (colour and transmittance): measured on LLVM, 90
-#: to 210 a pair, as the rounding of arrays has it
-TRAINING_BYTES = {"cuda": (430, 160), "llvm": (300, 280)}  #: the same of a training step, with gradients and the loss;
-#: 140 to 280 a pair measured on LLVM; on CUDA, which keeps pixels' states for the adjoint, up to 430
-
-BELIEVED = 0.1  #: seconds for which memory that was free is taken to be
 
 
-MakeLists = Callable[[Splats, Footprints, int, int], TileLists]
-"""`bin_splats` or another way to the same lists: (splats, footprints, width, height) to lists."""
-
-
-def bin_splats(
-    splats: Splats,
-    footprints: Footprints,
-    width: int,
-    height: int,
-    few_sizes: bool = False,
-    training: bool = False,
-) -> TileLists:
+def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, few_sizes: bool = False) -> TileLists:
     """Sort splats [N] into the tiles of a width x height image. Raises WorkError for more pairs than can be
     sorted or held in memory. few_sizes: of lists, for pictures from all over, each of which has another number of
-    pairs; lists are up to half as long again. training: a training step has to find place in memory, not a picture.
+    pairs; lists are up to half as long again.
 
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
-    return bin_counted(splats, footprints, width, height, few_sizes, training)[0]
+    extent = Extent(dr.width(splats.x), width, height, few_sizes)
+    if extent.count == 0:
+        return lists_of_boxes(footprints, None, extent, 0)
+    boxes = make_boxes(_detached(splats), footprints, extent.live, extent.most, extent.grid)
+    return lists_of_boxes(footprints, boxes, extent, WAITING.counted(extent, boxes))
 
 
-def bin_counted(
-    splats: Splats,
-    footprints: Footprints,
-    width: int,
-    height: int,
-    few_sizes: bool = False,
-    training: bool = False,
-) -> tuple[TileLists, int]:
-    """`bin_splats`, and how many pairs boxes have, which the lists' capacity is enough for."""
-    splats = _detached(splats)
-    boxes, grid, count = _find_boxes(splats, footprints, width, height)
-    pairs = 0 if boxes is None else boxes.pairs
-    capacity = list_capacity(pairs, width * height, few_sizes, training)
-    if capacity == 0 or boxes is None:
-        none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(count, 1))
-        return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape), 0
-    return make_lists(footprints, boxes, held(capacity, "pairs"), capacity, round_capacity(count), grid), pairs
-
-
-def bin_async(
-    splats: Splats, footprints: Footprints, width: int, height: int, capacity: int
-) -> tuple[TileLists, AsyncNumber]:
-    """`bin_counted` without a wait: lists with a `capacity` for so many pairs. Where there are more, which the number
-    says later, they are empty. There must be a splat. Whether there is memory, `check_memory` says."""
-    splats = _detached(splats)
-    boxes, grid, count = _find_boxes(splats, footprints, width, height)
-    assert boxes is not None, "lists without splats have no capacity"
-    assert boxes.pair_ends is not None
-    pairs = AsyncNumber(boxes.pair_ends, boxes.last)  # copied before what comes next
-    return make_lists(footprints, boxes, held(capacity, "pairs"), capacity, round_capacity(count), grid), pairs
-
-
-def _find_boxes(splats: Splats, footprints: Footprints, width: int, height: int) -> tuple[Boxes | None, Grid, int]:
-    """(boxes, None of no splats; the image's tiles; how many splats)."""
-    grid, count = Grid.of(width, height), dr.width(splats.x)
-    if count == 0:
-        return None, grid, 0
-    return make_boxes(splats, footprints, held(count, "splats"), round_capacity(count), grid), grid, count
+def lists_of_boxes(footprints: Footprints, boxes: Boxes | None, extent: Extent, capacity: int) -> TileLists:
+    """Lists of boxes with a capacity for their pairs; 0: there are none, or no boxes."""
+    grid = extent.grid
+    if boxes is None or capacity == 0:
+        none, of_splats = dr.zeros(ad.UInt32, grid.tiles), dr.zeros(ad.UInt32, max(extent.count, 1))
+        return TileLists(none, none, none, none, of_splats, of_splats, 0, grid.columns, grid.rows, grid.shape)
+    return make_lists(footprints, boxes, held(capacity, "pairs"), extent.capacities(capacity), grid)
 
 
 def make_boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
@@ -108,83 +58,22 @@ def make_boxes(splats: Splats, footprints: Footprints, count: UInt32, capacity: 
     return (count_boxes if select() == "cuda" else _rank)(splats, footprints, count, capacity, grid)
 
 
-def list_capacity(pairs: int, pixels: int, few_sizes: bool, training: bool = False) -> int:
-    """Capacity of lists of so many pairs, 0 of none. Raises WorkError, see `bin_splats`."""
-    check_memory(pairs, pixels, training)
-    return rounded_pairs(pairs, few_sizes)
-
-
-def rounded_pairs(pairs: int, few_sizes: bool) -> int:
-    """Capacity of lists of so many pairs, whether there is memory for them or not; 0 of none."""
-    return round_capacity(pairs, FEW if few_sizes and pairs < LONG else STEPS) if pairs else 0
-
-
-def make_lists(
-    footprints: Footprints, boxes: Boxes, limit: UInt32, capacity: int, splat_capacity: int, grid: Grid
-) -> TileLists:
-    """Lists with a capacity for so many pairs; may be part of a recording. They are empty where there are more than
-    `limit`, the capacity on the device. splat_capacity: M of the boxes"""
+def make_lists(footprints: Footprints, boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> TileLists:
+    """Lists of such capacities; may be part of a recording. They are empty where there are more pairs than `limit`,
+    the capacity on the device."""
     if select() == "cuda":
-        return count_lists(footprints, boxes, limit, Capacities(capacity, splat_capacity), grid)
-    return _expand(boxes, limit, capacity, splat_capacity, grid)
+        return count_lists(footprints, boxes, limit, capacities, grid)
+    return _expand(boxes, limit, capacities, grid)
 
 
 def _detached(splats: Splats) -> Splats:
     return dr.detach(splats) if dr.grad_enabled(list(vars(splats).values())) else splats  # to detach takes long
 
 
-def check_memory(pairs: int, pixels: int, training: bool) -> None:
-    """Raises WorkError where lists of so many pairs cannot be made, or find no place in memory, see `bin_splats`."""
-    bytes_a_pair, bytes_a_pixel = TRAINING_BYTES[select()] if training else PICTURE_BYTES
-    needed = pairs * bytes_a_pair + pixels * bytes_a_pixel
-    most = MAX_PAIRS[select()]
-    if pairs > most:
-        raise WorkError(f"rasterizer: {pairs:.3g} pairs of tile and splat, at most {most:.3g} can be sorted")
-    if needed <= 2**28 or _found.holds(needed):
-        return
-    free = free_memory(needed)
-    if free is not None and needed > free:
-        raise WorkError(
-            f"rasterizer: {pairs:.3g} pairs of tile and splat on {pixels:.3g} pixels need about {needed / 1e9:.3g} GB "
-            f"of memory, {free / 1e9:.3g} GB are free"
-        )
-    _found.note(needed)
-
-
-def has_memory(pairs: int, pixels: int, training: bool) -> bool:
-    """Whether `check_memory` raises nothing."""
-    try:
-        check_memory(pairs, pixels, training)
-    except WorkError:
-        return False
-    return True
-
-
-class _Found:
-    """Memory that was free a moment ago: to ask takes as long as some kernels."""
-
-    def __init__(self) -> None:
-        self.clear()
-
-    def holds(self, needed: int) -> bool:
-        """Whether as many bytes were free less than `BELIEVED` seconds ago."""
-        return needed <= self._bytes and time.monotonic() < self._until
-
-    def note(self, needed: int) -> None:
-        """So many bytes are."""
-        self._bytes, self._until = needed, time.monotonic() + BELIEVED
-
-    def clear(self) -> None:
-        """Nothing is known."""
-        self._bytes, self._until = 0, 0.0
-
-
-_found = _Found()
-
-
 @recorded
 def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
+    dr.eval(splats, footprints)
     index = dr.arange(ad.UInt32, capacity)
     live = index < count
     live &= dr.gather(ad.Bool, footprints.visible, index, live)
@@ -206,14 +95,9 @@ def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, 
 
 
 @recorded
-def _expand(
-    boxes: Boxes,
-    limit: UInt32,
-    capacity: int,
-    splat_capacity: int,
-    grid: Grid,
-) -> TileLists:
+def _expand(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> TileLists:
     """Lists from two stable sorts."""
+    capacity, splat_capacity = capacities.pairs, capacities.splats
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
     assert boxes.order is not None

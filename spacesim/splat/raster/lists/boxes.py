@@ -51,15 +51,10 @@ class Boxes:
     large_count: UInt32 | None = None  #: on CUDA, how many they are, of width 1
 
     @property
-    def last(self) -> int:
-        """Where `pair_ends` says how many pairs there are."""
-        return dr.width(self.pair_ends) - 1
-
-    @property
     def pairs(self) -> int:
         """How many they are. Waits for the device."""
         assert self.pair_ends is not None, "pairs have no numbers"
-        return int(self.pair_ends[self.last])
+        return int(self.pair_ends[dr.width(self.pair_ends) - 1])
 
     def that_fit(self, limit: UInt32) -> tuple[Bool, UInt32]:
         """Whether all pairs are within a limit, of width 1; how many they are, 0 where they are not."""

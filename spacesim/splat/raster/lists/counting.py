@@ -5,7 +5,6 @@ pair's splat, and to keep what was found, takes longer. Splats of many tiles hav
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import cast
 
 import drjit as dr
@@ -13,24 +12,17 @@ import drjit as dr
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, UInt32, UInt64
 from spacesim.splat.raster.lists.boxes import Boxes, Grid, each_tile, find_boxes, packed
+from spacesim.splat.raster.lists.capacity import Capacities
 from spacesim.splat.raster.lists.sort import empty_entries, entry_of, list_bounds, ordered_entries
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats
 from spacesim.splat.raster.records import load
 
 MAX_LANES = 32  #: threads that share a splat's pairs: a warp
-MANY = 256  #: tiles of a box from which on it is a large one's
+MANY = 256  #: tiles of a box; one of more is a large splat's
 LANES_OF_LARGE = 1024  #: of which there are always as many threads, or a multiple
 Visit = Callable[[UInt32, UInt32], None]
 """(number of a pair within its splat's box, its tile, the number of tiles where it is in none)."""
-
-
-@dataclass(frozen=True)
-class Capacities:
-    """Of the arrays of a picture's lists."""
-
-    pairs: int  #: P
-    splats: int  #: M
 
 
 @recorded

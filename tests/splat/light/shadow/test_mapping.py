@@ -257,7 +257,7 @@ def test_models_of_any_size(name, most, monkeypatch):
         ]
 
     recorded = found()
-    monkeypatch.setattr(mapping, "_tested", mapping._tested.traced)
+    monkeypatch.setattr(mapping, "occlusion_in_map", mapping.occlusion_in_map.traced)
     for one, other in zip(recorded, found(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert 0.05 < recorded[0].mean() < most

@@ -73,7 +73,7 @@ def _ways(request, monkeypatch) -> None:
     if request.param == "CUDA's way":
         take_cudas(monkeypatch)
         monkeypatch.setattr(splatting, "select", lambda: "cuda")
-        monkeypatch.setattr(splatting, "_walk", recorded(splatting._walk.traced))
+        monkeypatch.setattr(splatting, "occlusion_in_events", recorded(splatting.occlusion_in_events.traced))
 
 
 @pytest.mark.usefixtures("_ways")

@@ -13,7 +13,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.records import Camera, Dataset
 from spacesim.data.store import read_dataset
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss
 from spacesim.splat.train.trainer import Trainer
@@ -98,7 +98,7 @@ def test_splats_in_the_half_stay_or_fade(small_dataset, tmp_path, key):
     trainer.gaussians = Gaussians.from_numpy({**small, "log_scales": np.full_like(small["log_scales"], -3.5)})
     rows = trainer.gaussians.rows()
     camera = Pinhole.of(view.camera)
-    splats, footprints, _, _ = trainer._view_pass._project(rows, camera, 0, False, (), 1.0, False)
+    splats, footprints = project(Gaussians.from_rows(rows), camera)
     reach = np.array(splats.x) + np.array(footprints.half_width)
     there = np.flatnonzero(np.array(footprints.visible) & (reach < camera.width // 2))
     assert len(there) >= 2
