@@ -92,7 +92,12 @@ def tile_of_pair(ellipse: list[Float], within: UInt32, exists: Bool | bool, grid
 
 
 def each_tile(
-    ellipse: list[Float], pairs: UInt32, lane: UInt32, lanes: int, grid: Grid, visit: Callable[[UInt32, UInt32], None]
+    ellipse: list[Float],
+    pairs: UInt32,
+    lane: UInt32,
+    lanes: UInt32,
+    grid: Grid,
+    visit: Callable[[UInt32, UInt32], None],
 ) -> None:
     """Visit (the pair within its box, its tile) of the pairs of a splat, which `lanes` threads share; see
     `tile_of_pair`."""

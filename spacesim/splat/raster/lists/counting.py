@@ -126,28 +126,26 @@ def _each_pair(
 ) -> None:
     """Visit all pairs of boxes, none where not `fit`: by what `visit_of` gives for a splat that is there."""
     lanes, capacity = _lanes(capacities), capacities.splats
-    thread = dr.arange(ad.UInt32, capacity * lanes)
-    splat = dr.minimum(thread // lanes, boxes.splats - 1)
-    pairs = dr.gather(ad.UInt32, boxes.count, splat)
-    pairs = dr.select(fit & (pairs <= MANY) & (thread // lanes < boxes.splats), pairs, 0)
-    each_tile(load(boxes.records, splat, capacity), pairs, thread % lanes, lanes, grid, visit_of(splat))
-
-    assert boxes.large is not None
+    thread, large = dr.arange(ad.UInt32, capacity * lanes), boxes.large
+    assert large is not None
     assert boxes.large_count is not None
     large_count = dr.select(fit, dr.gather(ad.UInt32, boxes.large_count, ad.UInt32(0)), 0)
-    groups = capacity * lanes // LANES_OF_LARGE
+    group, groups = thread // LANES_OF_LARGE, capacity * lanes // LANES_OF_LARGE
 
-    def has_more(number: UInt32) -> Bool:
-        return number < large_count
+    def has_more(turn: UInt32) -> Bool:
+        return turn <= large_count
 
-    def visit_large(number: UInt32) -> tuple[UInt32]:
-        splat = dr.gather(ad.UInt32, boxes.large, number)
-        ellipse, pairs = load(boxes.records, splat, capacity), dr.gather(ad.UInt32, boxes.count, splat)
-        each_tile(ellipse, pairs, thread % LANES_OF_LARGE, LANES_OF_LARGE, grid, visit_of(splat))
-        return (number + groups,)
+    def visit(turn: UInt32) -> tuple[UInt32]:
+        """First a thread's own splat, then large ones."""
+        own, number = turn == 0, thread // lanes
+        splat = dr.select(own, dr.minimum(number, boxes.splats - 1), dr.gather(ad.UInt32, large, turn - 1, ~own))
+        pairs = dr.gather(ad.UInt32, boxes.count, splat)
+        pairs = dr.select(~own | (fit & (pairs <= MANY) & (number < boxes.splats)), pairs, 0)
+        lane, step = dr.select(own, thread % lanes, thread % LANES_OF_LARGE), dr.select(own, lanes, LANES_OF_LARGE)
+        each_tile(load(boxes.records, splat, capacity), pairs, lane, ad.UInt32(step), grid, visit_of(splat))
+        return (turn + dr.select(own, 1 + group, groups),)
 
-    first = thread // LANES_OF_LARGE
-    dr.while_loop((first,), has_more, visit_large, mode="symbolic", label="large splats")
+    dr.while_loop((ad.UInt32(0),), has_more, visit, mode="symbolic", label="tiles of splats")
 
 
 def _lanes(capacities: Capacities) -> int:

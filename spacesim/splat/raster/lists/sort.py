@@ -55,7 +55,7 @@ class ListBounds:
     sums: UInt32 | UInt64  #: entries up to the end of each list
     start: UInt32  #: of each list
     end: UInt32  #: of each list
-    cursor: UInt32  #: the starts once more: an increment takes a list's next place
+    cursor: UInt32  #: the starts once more, of what fits: an increment takes a list's next place
     #: all lists by classes of length, the longest first, those of a class in any order
     order: UInt32
 
@@ -76,7 +76,7 @@ def list_bounds(lengths: UInt32, number: type[UInt32] | type[UInt64], limit: UIn
     counts, class_ = dr.zeros(ad.UInt32, CLASSES), _class_of(lengths)
     rank = cast(UInt32, dr.scatter_inc(counts, class_))
     dr.eval(start, end, rank, class_, counts)
-    order, cursor = dr.empty(ad.UInt32, dr.width(lengths)), dr.gather(ad.UInt32, start, index)
+    order, cursor = dr.empty(ad.UInt32, dr.width(lengths)), end - lengths  # no copy of `start`: that is a launch
     dr.scatter(order, index, _count_longer(counts, class_) + rank)
     dr.eval(order, cursor)
     return ListBounds(sums, start, end, cursor, order)
