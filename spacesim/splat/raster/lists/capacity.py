@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from spacesim.backend import free_memory, select
@@ -45,12 +46,12 @@ class Extent:
         """N on the device."""
         return held(self.count, "splats")
 
-    @property
+    @cached_property
     def most(self) -> int:
         """M, the capacity of arrays of N."""
         return round_capacity(self.count)
 
-    @property
+    @cached_property
     def grid(self) -> Grid:
         """Its tiles."""
         return Grid.of(self.width, self.height)
