@@ -237,7 +237,8 @@ def test_constants_are_all_that_is_no_array():
     x = backend.ad.Float(1.0, 2.0)
 
     def key(value):
-        return recording._split(value, [])  # a key of dictionaries, to which 1, 1.0 and True are one
+        whole = []  # keys of dictionaries, to which 1, 1.0 and True are one
+        return recording._split(value, [], whole), tuple(whole)
 
     kinds = kinds_of_arguments(x)
     assert len({key(value) for value in kinds}) == len(kinds)
@@ -263,16 +264,18 @@ def test_code_for_one_structure_takes_the_arrays_of_no_other():
     first, second = ([*kinds_of_arguments(array), *((constant, array) for constant in large)] for array in (x, y))
     for place, value in enumerate(first):
         arrays, others = [], []
-        recording._split(value, arrays)
-        recording._split(second[place], others)
+        whole = []
+        recording._split(value, arrays, [])
+        recording._split(second[place], others, whole)
         flatten = flattener((value,), {"n": value}, recording._leaves, recording._constants, recording._field_names)
         for other, given in enumerate(second):
             found = flatten((given,), {"n": given})
             assert (found is None) == (other != place), (value, given)
             if found is not None:
-                assert list(map(id, found)) == list(map(id, 2 * others))
+                assert list(map(id, found[0])) == list(map(id, 2 * others))
+                assert found[1] == tuple(2 * whole)
         assert flatten((value,), {"m": value}) is flatten((value, value), {"n": value}) is None
-        assert len(flatten((value,), {"n": value})) == 2 * len(arrays)
+        assert len(flatten((value,), {"n": value})[0]) == 2 * len(arrays)
 
 
 def test_more_structures_than_code_is_kept_for(monkeypatch):
@@ -285,11 +288,23 @@ def test_more_structures_than_code_is_kept_for(monkeypatch):
     assert len(scaled._flatteners) == 3
 
 
+def test_code_for_a_structure_serves_all_whole_numbers():
+    """Capacities change from view to view."""
+    x = backend.ad.Float(1.0, 2.0)
+    scaled = backend.recorded(lambda x, pair, number: x * pair.one + number)
+    before = backend.recordings()
+    for first, second in [(2, 3), (3, 2), (2, 3), (5, 0), (3, 2), (2, 2), (5, 0)]:
+        found = scaled(x, _Pair(first), second)
+        assert found.numpy() == pytest.approx(first * x.numpy() + second)
+    assert len(scaled._flatteners) == 1
+    assert backend.recordings() - before == 4
+
+
 def test_the_first_arrays_of_a_type_have_the_same_key_as_the_next(monkeypatch):
     """Else the second call of a program would record anew."""
     monkeypatch.setattr(recording, "_leaves", set())
     x = backend.ad.Float(1.0, 2.0)
-    first, second = (recording._split(([x, x], {"a": [x]}, (x,), [[x], []]), []) for _ in range(2))
+    first, second = (recording._split(([x, x], {"a": [x]}, (x,), [[x], []]), [], []) for _ in range(2))
     assert first == second
 
 

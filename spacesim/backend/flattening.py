@@ -8,8 +8,10 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 FEW = 6  #: numbers of a constant that is looked into: what recordings give is an equal one each time, not the same
-Flatten = Callable[[tuple[Any, ...], dict[str, Any]], "list[Any] | None"]
-"""(arguments, named arguments) to their arrays in order, None where all else is not as expected."""
+Flatten = Callable[[tuple[Any, ...], dict[str, Any]], "tuple[list[Any], tuple[int, ...]] | None"]
+"""(arguments, named arguments) to their arrays and whole numbers in order, None where all else is not as expected."""
+FieldNames = Callable[[type], tuple[str, ...] | None]
+"""Names of a record's fields; None of what is none."""
 
 
 def flattener(
@@ -17,12 +19,11 @@ def flattener(
     named: dict[str, Any],
     leaves: set[type],
     constants: Mapping[int, tuple[Any, Any]],
-    names_of_fields: Callable[[type], tuple[str, ...] | None],
+    names_of_fields: FieldNames,
 ) -> Flatten:
     """For calls of the structure of this one, to which `recording._split` gives the same key, and for no others.
 
-    leaves: types of arrays, as known when called;  constants: objects whose second entry says all of them, by `id`;
-    names_of_fields: of a record, None of what is none
+    leaves: types of arrays, as known when called;  constants: objects whose second entry says all of them, by `id`
     """
     code = _Code(leaves, constants, names_of_fields)
     code.expect(arguments, "arguments")
@@ -35,13 +36,14 @@ class _Code:
         self,
         leaves: set[type],
         constants: Mapping[int, tuple[Any, Any]],
-        names_of_fields: Callable[[type], tuple[str, ...] | None],
+        names_of_fields: FieldNames,
     ) -> None:
         self.constants, self.names_of_fields = constants, names_of_fields
         self.scope: dict[str, Any] = {"leaves": leaves, "known": constants.get, "unknown": (None, None)}
         self.lines: list[str] = []
         self.last: list[str] = []  # conditions that take long, and hold where the others do
         self.arrays: list[str] = []
+        self.whole: list[str] = []
 
     def expect(self, value: Any, name: str) -> None:
         """That the variable `name` is of the structure of `value`."""
@@ -56,7 +58,10 @@ class _Code:
         elif kind is dict:
             self._require(f"type({name}) is dict and [*{name}] == {self._object([*value])}")
             self._expect_each(value.values(), f"{name}.values()")
-        elif id(value) in self.constants and self._size(value) > FEW:
+        elif kind is int:
+            self._require(f"type({name}) is int")
+            self.whole.append(name)
+        elif id(value) in self.constants:
             self._require(f"known(id({name}), unknown)[1] == {self._object(self.constants[id(value)][1])}")
         elif (fields := self.names_of_fields(kind)) is not None:
             self._require(f"type({name}) is {self._object(kind)}")
@@ -72,19 +77,15 @@ class _Code:
     def function(self) -> Flatten:
         """All that was expected."""
         tests = f"    if not ({' and '.join(self.last)}): return None" if self.last else ""
-        lines = ["def flatten(arguments, named):", *self.lines, tests, f"    return [{', '.join(self.arrays)}]"]
+        whole = "".join(f"{name}, " for name in self.whole)
+        found = f"    return [{', '.join(self.arrays)}], ({whole})"
+        lines = ["def flatten(arguments, named):", *self.lines, tests, found]
         exec("\n".join(lines), self.scope)
         flatten: Flatten = self.scope["flatten"]
         return flatten
 
     def _is_array(self, value: object) -> bool:
         return type(value) in self.scope["leaves"]
-
-    def _size(self, value: object) -> int:
-        """How many numbers and texts it is made of."""
-        fields = self.names_of_fields(type(value)) or ()
-        parts = value if isinstance(value, tuple) else [getattr(value, field) for field in fields]
-        return sum(map(self._size, parts)) if parts or fields else 1
 
     def _require(self, condition: str) -> None:
         self.lines.append(f"    if not ({condition}): return None")
@@ -102,3 +103,10 @@ class _Code:
         name = f"c{len(self.scope)}"
         self.scope[name] = value
         return name
+
+
+def size_of(value: object, names_of_fields: FieldNames) -> int:
+    """How many numbers and texts it is made of."""
+    fields = names_of_fields(type(value)) or ()
+    parts = value if isinstance(value, tuple) else [getattr(value, field) for field in fields]
+    return sum(size_of(part, names_of_fields) for part in parts) if parts or fields else 1

@@ -10,11 +10,11 @@ from functools import cache, update_wrapper
 from operator import attrgetter
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
-from spacesim.backend.flattening import Flatten, flattener
+from spacesim.backend.flattening import FEW, Flatten, flattener, size_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
-RECENT = 4  #: structures of arguments that a call may have, before it is walked through for what it has
+RECENT = 4  #: structures that a call's arguments may have, before it is walked through for what it has
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
 _PLAIN = frozenset((int, float, bool, str, type(None)))
@@ -88,11 +88,12 @@ class Recorded(Generic[P, R]):
         import drjit as dr
 
         update_wrapper(self, function)
-        self.traced, self._elements, self._names = function, elements, _Names()
-        self._flatteners: dict[str | None, Flatten] = {}  # by names, of no more than there are recordings
-        self._recent: deque[str] = deque(maxlen=RECENT)  # names, the latest walked through last
-        self._latest: str | None = None  # name of the latest call
-        self._after: dict[str | None, str] = {}  # names, and what came next the last time
+        self.traced, self._elements = function, elements
+        self._structures, self._names = _Names(), _Names()
+        self._flatteners: dict[str | None, Flatten] = {}  # by structures, of no more than there are recordings
+        self._recent: deque[str] = deque(maxlen=RECENT)  # structures, the latest walked through last
+        self._latest: str | None = None  # structure of the latest call
+        self._after: dict[str | None, str] = {}  # structures, and what came next the last time
         now = self._now = _Arguments(function)
 
         # Dr.Jit walks through what a function has from outside at every call, but not through its defaults.
@@ -128,26 +129,27 @@ class Recorded(Generic[P, R]):
 
     def _flat(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> tuple[str, list[Any]]:
         """A text for all that is no array, and the arrays."""
-        for name in (self._after.get(self._latest), *self._recent):  # calls come in the same order step by step
-            flatten = self._flatteners.get(name)
+        for structure in (self._after.get(self._latest), *self._recent):  # calls come in the same order step by step
+            flatten = self._flatteners.get(structure)
             flat = flatten(arguments, named) if flatten else None
             if flat is not None:
                 break
         else:
-            flat = []
-            kind = _split(arguments, flat), _split(named, flat)
-            is_known, name = kind in self._names, self._names[kind]
-            if is_known and name not in self._flatteners:  # what is seen once is not worth code
+            arrays: list[Any] = []
+            whole: list[int] = []
+            kind = _split(arguments, arrays, whole), _split(named, arrays, whole)
+            flat, is_known, structure = (arrays, tuple(whole)), kind in self._structures, self._structures[kind]
+            if is_known and structure not in self._flatteners:  # what is seen once is not worth code
                 if len(self._flatteners) >= RECORDINGS:
                     del self._flatteners[next(iter(self._flatteners))]
                     self._after.clear()
-                self._flatteners[name] = flattener(arguments, named, _leaves, _constants, _field_names)
-            if name not in self._flatteners:
-                return name, flat
-            self._recent.append(name)
-        assert name is not None
-        self._after[self._latest] = self._latest = name
-        return name, flat
+                self._flatteners[structure] = flattener(arguments, named, _leaves, _constants, _field_names)
+            if structure in self._flatteners:
+                self._recent.append(structure)
+        assert structure is not None
+        if structure in self._flatteners:
+            self._after[self._latest] = self._latest = structure
+        return self._names[structure, flat[1]], flat[0]
 
 
 _one_at_a_time = threading.RLock()
@@ -187,10 +189,13 @@ class _Names(dict[Any, str]):
 _names_of_constants = _Names()
 
 
-def _split(value: Any, arrays: list[Any]) -> Any:
-    """All of `value` that is no array, as a key of dictionaries; its arrays are added to a list. `flattener` writes
-    code that tells the same values apart."""
+def _split(value: Any, arrays: list[Any], whole: list[int]) -> Any:
+    """All of `value` that is no array, as a key of dictionaries, but for its whole numbers: in place of these their
+    type; they and the arrays are added to lists. `flattener` writes code that tells the same values apart."""
     kind = type(value)
+    if kind is int:
+        whole.append(value)
+        return kind
     if kind in _EQUAL_TO_INTEGERS:
         return kind, repr(value)
     if kind in _PLAIN:
@@ -199,23 +204,24 @@ def _split(value: Any, arrays: list[Any]) -> Any:
         arrays.extend(value)
         return kind, len(value)
     if kind is list or kind is tuple:
-        kinds = _split_each(value, arrays)
+        kinds = _split_each(value, arrays, whole)
         new = kind is list and all(part is ... for part in kinds)  # of a type that is in `_leaves` from now on
         return kind, len(kinds) if new else kinds
     if kind is dict:
-        return kind, tuple(value), _split_each(value.values(), arrays)
+        return kind, tuple(value), _split_each(value.values(), arrays, whole)
     constant = _constants.get(id(value))
     if constant is not None:
         return constant[1]
     values_of = _values_of(kind)  # type: ignore[arg-type]
     if values_of is not None:
-        before = len(arrays)
-        kinds = _split_each(values_of(value), arrays)
-        if len(arrays) > before or not _is_constant(value):
+        before, numbers = len(arrays), len(whole)
+        kinds = _split_each(values_of(value), arrays, whole)
+        if len(arrays) > before or not _is_constant(value) or size_of(value, _field_names) <= FEW:
             return kind, kinds
         if len(_constants) >= MAX_KEYS:
             _constants.clear()
-        _constants[id(value)] = value, (kind, _names_of_constants[kinds])
+        _constants[id(value)] = value, (kind, _names_of_constants[kinds, tuple(whole[numbers:])])
+        del whole[numbers:]
         return _constants[id(value)][1]
     _leaves.add(kind)
     arrays.append(value)
@@ -231,17 +237,14 @@ def _is_constant(value: Any) -> bool:
     return bool(type(value).__dataclass_params__.frozen)
 
 
-def _split_each(values: Iterable[Any], arrays: list[Any]) -> tuple[Any, ...]:
+def _split_each(values: Iterable[Any], arrays: list[Any], whole: list[int]) -> tuple[Any, ...]:
     kinds = []
     for value in values:
-        kind = type(value)
-        if kind in _leaves:  # as most are
+        if type(value) in _leaves:  # as most are
             arrays.append(value)
             kinds.append(...)
-        elif kind is int:
-            kinds.append(value)
         else:
-            kinds.append(_split(value, arrays))
+            kinds.append(_split(value, arrays, whole))
     return tuple(kinds)
 
 
