@@ -8,6 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import drjit as dr
@@ -47,6 +48,8 @@ from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
 
 log = logging.getLogger(__name__)
+
+BACKGROUNDS = 1024  #: colours that are drawn at once
 
 
 class Trainer(TrainingLoop):
@@ -329,7 +332,8 @@ class Trainer(TrainingLoop):
         config = self.config
         if not config.random_background or (view.opaque and not config.random_behind_opaque):
             return np.zeros(3, np.float32)
-        return np.random.default_rng([config.seed, 3, index]).uniform(size=3).astype(np.float32)
+        colors: Array = _backgrounds(config.seed, index // BACKGROUNDS)[index % BACKGROUNDS]
+        return colors
 
     def rates(self, index: int) -> list[float]:
         """The step size of each row."""
@@ -368,6 +372,12 @@ class Trainer(TrainingLoop):
             self.gaussians.features = upload(features.T.ravel())
         frame = TrainingFrame(centre, self.scene_scale, farthest_camera(dataset, centre), robust_radius(means))
         return LightModel.initial(self.config.light, frame, self.config.seed, len(self.views))
+
+
+@lru_cache(maxsize=2)
+def _backgrounds(seed: int, block: int) -> Array:
+    """[BACKGROUNDS, 3] float32: of so many steps, for to start a generator takes longer than some kernels."""
+    return np.random.default_rng([seed, 3, block]).uniform(size=(BACKGROUNDS, 3)).astype(np.float32)
 
 
 def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:

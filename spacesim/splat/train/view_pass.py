@@ -37,7 +37,7 @@ from spacesim.splat.train.stages import (
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
-KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
+KEPT = 4096  #: cameras that are kept on the device: a training shows the same ones again and again
 
 
 @dataclass
@@ -120,7 +120,7 @@ class ViewPass:
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
         self._settings = ViewSettings(config.antialiased, config.shape_terms, scale)
         self._loss = recorded(picture_loss)
-        self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
+        self._camera = lru_cache(KEPT)(partial(_device_camera, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -161,11 +161,6 @@ class ViewPass:
         blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
-
-    def _camera(self, camera: Camera, downscale: int) -> Pinhole:
-        """With as many pixels as are blended of a view."""
-        numbers, width, height = self._camera_numbers(camera, downscale)
-        return Pinhole(ad.Float(numbers), width, height)
 
     def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
         """Compare a view that was drawn. camera: of the target"""
@@ -220,9 +215,10 @@ class ViewPass:
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 
 
-def _camera_numbers(supersample: int, camera: Camera, downscale: int) -> tuple[list[float], int, int]:
+def _device_camera(supersample: int, camera: Camera, downscale: int) -> Pinhole:
+    """With as many pixels as are blended of a view."""
     blended = upsampled_camera(camera.downscaled(downscale), supersample)
-    return pinhole_numbers(blended), blended.width, blended.height
+    return Pinhole(ad.Float(pinhole_numbers(blended)), blended.width, blended.height)
 
 
 def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:
