@@ -257,10 +257,10 @@ def test_methods_with_shadows_refine_poses_too(small_lit_dataset, method):
 
 def test_no_picture_is_recorded_anew(small_dataset):
     trainer, known = Trainer(small_dataset, replace(CONFIG, exposure_per_picture=True)), []
-    for _ in range(16):
+    for _ in range(24):
         trainer.step()
         known.append(recordings())
-    assert len(set(known[8:])) == 1
+    assert len(set(known[16:])) == 1  # from the second visits of eight views on, the host may not wait for lists
 
 
 def test_a_run_tells_of_its_poses(small_dataset, tmp_path, caplog):
