@@ -111,9 +111,31 @@ def test_both_ways_list_the_same(count, size, monkeypatch):
     assert sum(map(len, found[0])) > count / 2
 
 
+def test_needles_are_listed_wherever_they_are_drawn(way):
+    """Half a pixel thin, thousands long, aslant: the terms of their form cancel, what is left is mostly rounding."""
+    width, height, long, count = 500, 350, 3000.0, 20
+    rng = np.random.default_rng(1)
+    turn, off = rng.uniform(0.3, 1.2, count), long * rng.uniform(-1.5, 1.5, count)
+    x = rng.uniform(0, width, count) + off * np.cos(turn)
+    y = rng.uniform(0, height, count) + off * np.sin(turn)
+    xx, yy = (long * np.cos(turn)) ** 2 + 0.3, (long * np.sin(turn)) ** 2 + 0.3
+    xy, determinant = long**2 * np.sin(turn) * np.cos(turn), 0.3 * (long**2 + 0.3)
+    opacity, one = np.full(count, 0.99), np.ones(count)
+    conic = yy / determinant, -xy / determinant, xx / determinant
+    splats = Splats(*(upload(values.astype(np.float32)) for values in (x, y, *conic, opacity, one)))
+    reach = 2 * np.log(255 * opacity)
+    halves = (upload(np.sqrt(reach * half).astype(np.float32)) for half in (xx, yy))
+    visible, order = upload(one.astype(bool), ad.Bool), upload(np.arange(count, dtype=np.uint32), ad.UInt32)
+    footprints = Footprints(*halves, visible, order)
+    lists = binning.bin_splats(splats, footprints, width, height)
+    certain, _ = expected(splats, footprints, width, height, lists.shape)
+    assert sum(map(len, certain)) > 300
+    assert all(set(wanted) <= set(found) for wanted, found in zip(certain, listed(lists), strict=True))
+
+
 @pytest.mark.parametrize("many", [0, 250, 700])
 def test_splats_of_many_tiles_are_listed_as_others(many, monkeypatch):
-    """By threads of their own: all of them, most, and few; more pairs than such a splat has threads, too."""
+    """After the others, by more threads each: all, most, and few of them; more pairs than threads, too."""
     size = 480, 340
     splats, footprints = projected(60, *size)
     found = []

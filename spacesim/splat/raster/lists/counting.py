@@ -1,7 +1,8 @@
 """Tile lists on CUDA: pairs are counted into their tiles, and each list is ordered by itself (`sort.py`).
 
 Pairs are found twice, to be counted and to be listed, by threads that each go through some of a splat's: to look for a
-pair's splat, and to keep what was found, takes longer. Splats of many tiles have threads of their own.
+pair's splat, and to keep what was found, takes longer. Splats of many tiles follow, by more
+threads each.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from spacesim.splat.raster.records import load
 
 MAX_LANES = 32  #: threads that share a splat's pairs: a warp
 MANY = 256  #: tiles of a box; one of more is a large splat's
-LANES_OF_LARGE = 1024  #: of which there are always as many threads, or a multiple
+LANES_OF_LARGE = 1024  #: threads that share a large splat's pairs; `round_capacity` gives multiples of as many
 Visit = Callable[[UInt32, UInt32], None]
 """(number of a pair within its splat's box, its tile, the number of tiles where it is in none)."""
 

@@ -19,6 +19,7 @@ from spacesim.splat.raster.lists.capacity import (
     Extent,
     PairCounts,
     has_memory,
+    list_capacity,
     rounded_pairs,
 )
 
@@ -40,7 +41,7 @@ def expected_capacity(extent: Extent) -> int | None:
 
 
 def observe(extent: Extent, pairs: int) -> None:
-    """A picture has so many pairs of tile and splat."""
+    """A picture has so many pairs of tile and splat: in its lists, or, where these alone were counted, in boxes."""
     needed, kind = rounded_pairs(pairs, extent.few_sizes), _kind(extent)
     with _lock:
         before = _capacities.pop(kind, 0)
@@ -76,8 +77,9 @@ class _PicturePairs:
         self._pending.append((extent, capacity, AsyncNumber(pair_ends)))
 
     def counted(self, extent: Extent, boxes: Boxes) -> int:
-        capacity = WAITING.counted(extent, boxes)
-        observe(extent, boxes.pairs)
+        pairs = boxes.pairs
+        capacity = list_capacity(pairs, extent)
+        observe(extent, pairs)
         return capacity
 
     def all_fit(self) -> bool:

@@ -20,7 +20,7 @@ from spacesim.backend.arrays import Array2u64, Bool, UInt32, UInt64
 SIZES = 64, 4096  #: entries, powers of two: so many are compared each with each (with 32, 128 or 256 an H100 takes
 #: longer); of these as many as are searched in one pass, the lists of pictures being short
 SIZES_OF_LONG = 64, 512, 4096, 32768, 262144  #: passes that take less where lists are long
-ROOM = 512  #: entries a list for which there is room, from which on lists may be long
+ROOM = 512  #: entries a list for which there is room; where there is more, lists may be long
 WAYS = 4  #: parts of what is left, of which a search takes one: fewer steps than by halves; 8 are slower
 COMPARED = 4  #: entries compared in a turn of the loop
 #: of lengths of lists: a block of threads waits for its longest walk; with neighbours of one class an H100 blends in
