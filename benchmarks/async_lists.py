@@ -20,7 +20,7 @@ from support.synthetic import still_trainer, write_dataset
 from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.records import Sun
-from spacesim.splat.train.async_lists import AsyncTileLists
+from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import METHODS, preset
 from spacesim.splat.train.trainer import Trainer
 
@@ -29,7 +29,7 @@ WARM_UP = 4  #: times as many: every view has been seen twice, and most again
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "3000x64"}
 
 
-class Counted(AsyncTileLists):
+class Counted(TrainingPairs):
     """Counts steps whose lists were too small."""
 
     again = 0
@@ -77,9 +77,9 @@ def measure(count: int, pixels: int, method: str, name: str, options: Any) -> co
     return row | {"kernels": kernels.milliseconds, "launches": kernels.launches, "again": ways["async"].again}
 
 
-def steps(trainer: Trainer, lists: AsyncTileLists, count: int) -> tuple[float, float]:
+def steps(trainer: Trainer, lists: TrainingPairs, count: int) -> tuple[float, float]:
     """Seconds a step, all in all and of the host."""
-    trainer._view_pass.lists = lists
+    trainer._view_pass.pairs = lists
     common.synchronise()
     start = time.perf_counter()
     for _ in range(count):

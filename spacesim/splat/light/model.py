@@ -235,6 +235,8 @@ class LightModel:
         last, changes = self._last_sunlight, dr.grad_enabled(read)
         if not changes and asked == last.asked and _are_same(read, last.read):
             return last
+        if not changes:
+            self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # frees memory for the next
         sunlight = self.arriving(gaussians, sun, self._visibility(gaussians, sun, pairs), embedding)
         return _LastSunlight([] if changes else _kept(read), asked, sunlight)
 

@@ -14,7 +14,7 @@ from spacesim.backend import select
 from spacesim.backend.arrays import UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.splat.raster.lists.boxes import Boxes
-from spacesim.splat.raster.lists.capacity import LONG, WAITING, Extent, has_memory
+from spacesim.splat.raster.lists.capacity import LONG, Extent, has_memory, list_capacity
 from spacesim.splat.raster.lists.tiles import round_capacity
 
 HISTORY = 16  #: changes from a view's last visit to the next, of which the largest counts
@@ -65,7 +65,7 @@ class _PendingLists:
     pairs: AsyncNumber
 
 
-class AsyncTileLists:
+class TrainingPairs:
     """Says for how many pairs a training's lists are made, and learns how many there are. backends: on which without a
     wait, where Dr.Jit can; on others it waits for each count."""
 
@@ -107,26 +107,27 @@ class AsyncTileLists:
 class ViewPairs:
     """`PairCounts` of a view of a training."""
 
-    def __init__(self, lists: AsyncTileLists, forecast: PairForecast, view: Hashable) -> None:
-        self.lists, self.forecast, self.view = lists, forecast, view
+    def __init__(self, training: TrainingPairs, forecast: PairForecast, view: Hashable) -> None:
+        self.training, self.forecast, self.view = training, forecast, view
 
     def expected(self, extent: Extent) -> int | None:
         """By its forecast, where that fits into memory; where it does not, the pairs that there are may. Of long lists
         the wait is short beside the work."""
-        capacity = self.forecast.capacity_for(self._key(extent)) if self.lists.is_async else None
-        if capacity is None or capacity > LONG or not has_memory(capacity, extent):
+        capacity = self.forecast.capacity_for(self._key(extent)) if self.training.is_async else None
+        if capacity is None or capacity >= LONG or not has_memory(capacity, extent):
             return None
         return capacity
 
     def check(self, extent: Extent, pair_ends: UInt32 | UInt64, capacity: int) -> None:
-        """See `PairCounts`; `AsyncTileLists.all_fit` says it."""
-        self.lists.pending.append(_PendingLists(self.forecast, self._key(extent), capacity, AsyncNumber(pair_ends)))
+        """See `PairCounts`; `TrainingPairs.all_fit` says it."""
+        self.training.pending.append(_PendingLists(self.forecast, self._key(extent), capacity, AsyncNumber(pair_ends)))
 
     def counted(self, extent: Extent, boxes: Boxes) -> int:
         """See `PairCounts`."""
-        capacity = WAITING.counted(extent, boxes)
-        if self.lists.is_async:
-            self.forecast.observe(self._key(extent), boxes.pairs)
+        pairs = boxes.pairs
+        capacity = list_capacity(pairs, extent)
+        if self.training.is_async:
+            self.forecast.observe(self._key(extent), pairs)
         return capacity
 
     def _key(self, extent: Extent) -> Hashable:

@@ -155,7 +155,7 @@ class Trainer(TrainingLoop):
         before = self.gaussians.logit_opacities
         self._refine_gaussians()
         if self.gaussians.logit_opacities.index != before.index:
-            self._view_pass.lists.after_refinement()
+            self._view_pass.pairs.after_refinement()
         source = self.optimizer.take_source()
         if self.light and source is not None:
             self.light.follow(source)
@@ -183,9 +183,9 @@ class Trainer(TrainingLoop):
         attraction = self._attraction(view)
         target = self._target_image(number, view, attraction)
         drawn, loss, grad_splats = self._splat_gradients(rows, degree, view, target, watched)
-        if not view_pass.lists.all_fit():
+        if not view_pass.pairs.all_fit():
             del drawn, loss, grad_splats  # of lists that are empty, and memory is short
-            with view_pass.lists.synchronous():
+            with view_pass.pairs.synchronous():
                 drawn, loss, grad_splats = self._splat_gradients(rows, degree, view, target, watched)
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
@@ -332,7 +332,7 @@ class Trainer(TrainingLoop):
         config = self.config
         if not config.random_background or (view.opaque and not config.random_behind_opaque):
             return np.zeros(3, np.float32)
-        colors: Array = _backgrounds(config.seed, index // BACKGROUNDS)[index % BACKGROUNDS]
+        colors: np.ndarray = _backgrounds(config.seed, index // BACKGROUNDS)[index % BACKGROUNDS]
         return colors
 
     def rates(self, index: int) -> list[float]:
@@ -375,9 +375,11 @@ class Trainer(TrainingLoop):
 
 
 @lru_cache(maxsize=2)
-def _backgrounds(seed: int, block: int) -> Array:
+def _backgrounds(seed: int, block: int) -> np.ndarray:
     """[BACKGROUNDS, 3] float32: of so many steps, for to start a generator takes longer than some kernels."""
-    return np.random.default_rng([seed, 3, block]).uniform(size=(BACKGROUNDS, 3)).astype(np.float32)
+    colors = np.random.default_rng([seed, 3, block]).uniform(size=(BACKGROUNDS, 3)).astype(np.float32)
+    colors.setflags(write=False)
+    return colors
 
 
 def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:

@@ -22,7 +22,7 @@ from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Pinhole, Splats
 from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.supersample import upsampled_camera
-from spacesim.splat.train.async_lists import AsyncTileLists
+from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
@@ -37,7 +37,7 @@ from spacesim.splat.train.stages import (
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
-KEPT = 4096  #: cameras that are kept on the device: a training shows the same ones again and again
+KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
 
 
 @dataclass
@@ -100,11 +100,11 @@ class ViewResult:
 class ViewPass:
     """Forward and backward of views, one after another. scale: of the scene, metres, the unit of depth
 
-    lists: makes the tile lists; nothing may be kept of a view before it has said that they `all_fit`
+    pairs: says for how many tile lists are made; nothing may be kept of a view before it has said that they `all_fit`
     """
 
     def __init__(self, config: TrainConfig, scale: float) -> None:
-        self.config, self.scale, self.lists = config, scale, AsyncTileLists()
+        self.config, self.scale, self.pairs = config, scale, TrainingPairs()
         terms = LossSettings(
             config.ssim_weight,
             config.visibility_weight,
@@ -120,7 +120,7 @@ class ViewPass:
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
         self._settings = ViewSettings(config.antialiased, config.shape_terms, scale)
         self._loss = recorded(picture_loss)
-        self._camera = lru_cache(KEPT)(partial(_device_camera, config.supersample))
+        self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -135,32 +135,38 @@ class ViewPass:
     ) -> RenderedView:
         """Draw a view. rows: `gaussians.rows()`;  light: of a method of light;  degree: of the harmonics;  downscale:
         see `RenderedView`;  watched: whether densification wants to know of it"""
-        camera, pairs = self._camera(view.camera, downscale), self.lists.of_view("picture", view.index)
+        self.pairs.pending.clear()  # of a step that was interrupted
+        camera, pairs = self._camera(view.camera, downscale), self.pairs.of_view("picture", view.index)
         extent = Extent(gaussians.count, camera.width, camera.height, training=True)
         asked, grid = (rows, camera, degree, self._settings, watched, extent.live), extent.grid
         expected = pairs.expected(extent)
-        boxes: ViewSplats | None = None
+        drawn: ViewSplats | None = None
         if expected is None:
-            boxes = self._find_boxes(*asked, extent.most, grid)
-            splats, values, radii = boxes.splats, boxes.values, boxes.radii
+            drawn = self._find_boxes(*asked, extent.most, grid)
+            splats, values, radii = drawn.splats, drawn.values, drawn.radii
         else:
             limit, capacities = held(expected, "pairs"), extent.capacities(expected)
             splats, values, radii, lists, pair_ends = self._list(*asked, limit, capacities, grid)
             pairs.check(extent, pair_ends, expected)
-        of_sun = self.lists.of_view("sun", view.index)
+        of_sun = self.pairs.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
         if shading:
             values["color"] = shading.colors
             if self.config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
-        if boxes is not None:  # the host waits for as little as it can
-            capacity = pairs.counted(extent, boxes.boxes)
-            lists = lists_of_boxes(boxes.footprints, boxes.boxes, extent, capacity)
-            del boxes
+        if drawn is not None:  # after shading, which needs memory of its own
+            lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
+            del drawn
         planes = [value for group in values.values() for value in group]
         blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
         channels = {name: len(group) for name, group in values.items()}
         return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
+
+    def _camera(self, camera: Camera, downscale: int) -> Pinhole:
+        """With as many pixels as are blended of a view. A new array each time: two views of a step may be one, and no
+        array may stand in two places of a recording's arguments."""
+        numbers, width, height = self._camera_numbers(camera, downscale)
+        return Pinhole(ad.Float(numbers), width, height)
 
     def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
         """Compare a view that was drawn. camera: of the target"""
@@ -215,10 +221,9 @@ class ViewPass:
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 
 
-def _device_camera(supersample: int, camera: Camera, downscale: int) -> Pinhole:
-    """With as many pixels as are blended of a view."""
+def _camera_numbers(supersample: int, camera: Camera, downscale: int) -> tuple[list[float], int, int]:
     blended = upsampled_camera(camera.downscaled(downscale), supersample)
-    return Pinhole(ad.Float(pinhole_numbers(blended)), blended.width, blended.height)
+    return pinhole_numbers(blended), blended.width, blended.height
 
 
 def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:

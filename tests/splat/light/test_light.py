@@ -526,9 +526,9 @@ def test_shadows_of_pictures_whose_lists_do_not_fit_are_the_same(monkeypatch, na
     made: list[int] = []
     plain = picture_lists._PicturePairs.check
 
-    def spied(self, extent, boxes, capacity):
+    def spied(self, extent, pair_ends, capacity):
         made.append(capacity)
-        plain(self, extent, boxes, capacity)
+        plain(self, extent, pair_ends, capacity)
 
     monkeypatch.setattr(picture_lists._PicturePairs, "check", spied)
     light.sunlight(splats, suns[0])

@@ -16,7 +16,7 @@ from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import Footprints, Pinhole, project
 from spacesim.splat.train import async_lists
-from spacesim.splat.train.async_lists import ENOUGH, HISTORY, AsyncTileLists, PairForecast
+from spacesim.splat.train.async_lists import ENOUGH, HISTORY, PairForecast, TrainingPairs
 from spacesim.splat.train.config import TrainConfig, preset
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
@@ -68,7 +68,7 @@ def test_capacity_after_a_refinement_follows_views_seen_since():
     assert forecast.capacity_for(0) == round_capacity(int(1.02 * 20_000))
 
 
-class Counted(AsyncTileLists):
+class Counted(TrainingPairs):
     """Counts lists that were made without a wait, of which kinds of pictures, and steps whose lists were too small."""
 
     def __init__(self, backends: tuple[str, ...]) -> None:
@@ -83,11 +83,11 @@ class Counted(AsyncTileLists):
         return fits
 
 
-def trained(dataset, config, steps: int, lists: AsyncTileLists, start=None) -> tuple[Trainer, list[float]]:
+def trained(dataset, config, steps: int, lists: TrainingPairs, start=None) -> tuple[Trainer, list[float]]:
     trainer = Trainer(dataset, config)
     if start is not None:
         trainer.restore(start)
-    trainer._view_pass.lists = lists
+    trainer._view_pass.pairs = lists
     return trainer, [float(trainer.step()[0]) for _ in range(steps)]
 
 
@@ -167,7 +167,7 @@ def test_an_emptied_picture_has_an_empty_list():
     camera = Camera.from_fov(look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0]), 40, 40, 40)
     splats, boxes = project(Gaussians.from_numpy(random_splats(50, 0, degree=0)), Pinhole.of(camera))
     dr.eval(splats, boxes)
-    lists, extent = AsyncTileLists((select(),)), Extent(50, 40, 40)
+    lists, extent = TrainingPairs((select(),)), Extent(50, 40, 40)
 
     def capacity(view: int, footprints: Footprints) -> int:
         boxes = make_boxes(splats, footprints, extent.live, extent.most, extent.grid)
@@ -202,5 +202,5 @@ def test_where_a_forecast_does_not_fit_into_memory_pairs_are_counted(small_datas
 
 
 def test_lists_are_asynchronous_on_cuda_alone():
-    assert AsyncTileLists().is_async == (select() == "cuda")
-    assert not AsyncTileLists(()).is_async
+    assert TrainingPairs().is_async == (select() == "cuda")
+    assert not TrainingPairs(()).is_async

@@ -11,7 +11,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
-from spacesim.splat.train.async_lists import AsyncTileLists
+from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import TrainConfig, preset
 from spacesim.splat.train.downscale import covered_color, truth_of_squares, valid_squares
 from spacesim.splat.train.stages import LossSettings, TargetImage, picture_loss
@@ -122,7 +122,7 @@ def test_the_schedule_is_splatfactos():
 def test_pictures_grow_and_nothing_is_recorded_but_at_a_change(small_dataset, monkeypatch):
     frozen = replace(REFINEMENT, refine_start=10**6, refine_stop=10**6 + 1)
     trainer = Trainer(small_dataset, replace(CONFIG, refinement=frozen, sh_degree=0))
-    trainer._view_pass.lists = AsyncTileLists(())  # without waits there are recordings of their own
+    trainer._view_pass.pairs = TrainingPairs(())  # without waits there are recordings of their own
     sizes, made, forward = [], [], ViewPass.forward
 
     def watched(self, *given):
