@@ -1,10 +1,13 @@
 """The training pictures: decoded once, kept packed in memory, handed out in a seeded order."""
 
 import logging
+import threading
+import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import lru_cache
+from queue import SimpleQueue
 
 import numpy as np
 
@@ -80,7 +83,7 @@ class TrainingViews:
         self._decoded: set[int] = set()
         # what a mesh gives is computed on the device, and what is not kept would be decoded for nothing
         reads_ahead = surface is None and kept >= len(self._used)
-        self._decoders = ThreadPoolExecutor(DECODERS, "decode") if reads_ahead else None
+        self._decoders = _Decoders() if reads_ahead else None
         self._device_cache = lru_cache(maxsize=max(1, on_device // largest))(self._upload)
 
     def __len__(self) -> int:
@@ -166,6 +169,41 @@ class TrainingViews:
         planes |= {"depth": depth[..., None], "normal": normal}
         planes_first = {name: np.moveaxis(planes[name], -1, 0).astype(np.float32) for name in self.truth}
         return {name: [np.ascontiguousarray(plane).ravel() for plane in group] for name, group in planes_first.items()}
+
+
+_Task = tuple["Future[TrainingView]", Callable[[int], TrainingView], int]
+
+
+class _Decoders:
+    """Threads that load views. They are daemons: an exception that comes while a ThreadPoolExecutor starts a thread, as
+    Ctrl-C's may, leaves one that Python does not know and waits for at its exit."""
+
+    def __init__(self) -> None:
+        self._tasks: SimpleQueue[_Task | None] = SimpleQueue()
+        for _ in range(DECODERS):
+            threading.Thread(target=_decode, args=(self._tasks,), name="decode", daemon=True).start()
+        weakref.finalize(self, _end, self._tasks)
+
+    def submit(self, load: Callable[[int], TrainingView], index: int) -> "Future[TrainingView]":
+        """What `load` makes of a view's index, later."""
+        future: Future[TrainingView] = Future()
+        self._tasks.put((future, load, index))
+        return future
+
+
+def _decode(tasks: "SimpleQueue[_Task | None]") -> None:
+    while (task := tasks.get()) is not None:
+        future, load, index = task
+        try:
+            future.set_result(load(index))
+        except BaseException as error:
+            future.set_exception(error)
+        del task, future, load  # else whose pictures they are would live on
+
+
+def _end(tasks: "SimpleQueue[_Task | None]") -> None:
+    for _ in range(DECODERS):
+        tasks.put(None)
 
 
 def kept_bytes() -> tuple[int, int]:
