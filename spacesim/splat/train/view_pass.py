@@ -1,7 +1,7 @@
 """One view of a training step: forward from Gaussians to a picture, its loss, and backward to gradients of Gaussians.
 
-Stages of fixed shape (project, loss) are recorded once and replayed without tracing; binning and blending, whose lists
-change length from step to step, stand between them.
+All is recorded and replayed without tracing, lists and what reads them once for each capacity. Where the number of
+pairs is expected, a view is projected and listed in one recording; where it is not, the host waits between two.
 """
 
 from dataclasses import dataclass, field, replace

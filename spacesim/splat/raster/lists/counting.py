@@ -1,8 +1,7 @@
 """Tile lists on CUDA: pairs are counted into their tiles, and each list is ordered by itself (`sort.py`).
 
 Pairs are found twice, to be counted and to be listed, by threads that each go through some of a splat's: to look for a
-pair's splat, and to keep what was found, takes longer. Splats of many tiles follow, by more
-threads each.
+pair's splat, and to keep what was found, takes longer. Splats of many tiles follow, by more threads each.
 """
 
 from collections.abc import Callable
