@@ -7,7 +7,7 @@ as given, and so do shadows, as in the literature.
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import drjit as dr
@@ -87,9 +87,9 @@ class _Around:
 class _LastSunlight:
     """The Sun that was asked for last: cameras move more often than it does."""
 
-    read: list[Float]  #: the arrays that it was made of
-    asked: tuple[bytes | None, ...]  #: its direction, the embedding
-    sunlight: Sunlight
+    read: list[Float] = field(default_factory=list)  #: the arrays that it was made of
+    asked: tuple[bytes | None, ...] = ()  #: its direction, the embedding
+    sunlight: Sunlight = field(default_factory=lambda: Sunlight(None, []))  #: what it was
 
 
 @dataclass
@@ -121,7 +121,7 @@ class LightModel:
         self._around = _Around([], None)
         self._held: HeldSurroundings | None = None
         self._told = False  # that rays take long in training
-        self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
+        self._last_sunlight = _LastSunlight()
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
@@ -201,13 +201,13 @@ class LightModel:
         if isinstance(of, Gaussians):
             of = HeldSurroundings(Surfaces.of(of, self.config.field.features))
         self._held, self._around = of, _Around([], None)
-        self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # its emitters have other numbers
+        self._last_sunlight = _LastSunlight()  # its emitters have other numbers
 
     def follow(self, source: UInt32) -> None:
         """Each Gaussian was `source` [N] of those before: it sees what that one saw."""
         if self._held:
             self._held.follow(source)
-            self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))
+            self._last_sunlight = _LastSunlight()
 
     @property
     def held_surroundings(self) -> HeldSurroundings | None:
@@ -229,14 +229,14 @@ class LightModel:
     ) -> _LastSunlight:
         """What was asked for last, where that is asked for; `_remembered` keeps what holds."""
         if self.config.shadow is None and not self.config.bounce:
-            return _LastSunlight([], (), Sunlight(None, []))
+            return _LastSunlight()
         read = [*gaussians.rows(), *self.weights, *self.embeddings]
         asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
         last, changes = self._last_sunlight, dr.grad_enabled(read)
-        if not changes and asked == last.asked and _are_same(read, last.read):
-            return last
         if not changes:
-            self._last_sunlight = _LastSunlight([], (), Sunlight(None, []))  # frees memory for the next
+            if asked == last.asked and _are_same(read, last.read):
+                return last
+            self._last_sunlight = _LastSunlight()  # frees memory for the next
         sunlight = self.arriving(gaussians, sun, self._visibility(gaussians, sun, pairs), embedding)
         return _LastSunlight([] if changes else _kept(read), asked, sunlight)
 

@@ -46,13 +46,18 @@ def project_views(
     return splats, footprints, values, screen_radii(gaussians, splats, camera) if watched else None
 
 
-@dataclass(frozen=True)
-class ViewSettings:
-    """What of a view does not change from step to step, see `project_views`."""
+@dataclass
+class ViewRequest:
+    """What `project_views` takes, and how many splats that is."""
 
+    rows: list[Float]  #: of the Gaussians
+    camera: Pinhole  #: with as many pixels as are blended
+    degree: int  #: of the harmonics
     antialiased: bool  #: see `project`
     shape: tuple[str, ...]  #: what is blended for the sake of the shape
     scale: float  #: metres
+    watched: bool  #: whether `screen_radii` are wanted
+    count: UInt32  #: splats, of width 1
 
 
 @dataclass
@@ -66,37 +71,21 @@ class ViewSplats:
     boxes: Boxes  #: of the splats
 
 
-def find_view_boxes(
-    rows: list[Float],
-    camera: Pinhole,
-    degree: int,
-    settings: ViewSettings,
-    watched: bool,
-    count: UInt32,
-    capacity: int,
-    grid: Grid,
-) -> ViewSplats:
-    """`project_views`, and the tiles of the `count` splats, `capacity` at most."""
-    asked = settings.antialiased, settings.shape, settings.scale, watched
-    splats, footprints, values, radii = project_views(rows, camera, degree, *asked)
+def find_view_boxes(view: ViewRequest, capacity: int, grid: Grid) -> ViewSplats:
+    """`project_views`, and the tiles of the splats, `capacity` at most."""
+    splats, footprints, values, radii = project_views(
+        view.rows, view.camera, view.degree, view.antialiased, view.shape, view.scale, view.watched
+    )
     dr.schedule(splats, footprints, values, radii)
-    return ViewSplats(splats, footprints, values, radii, make_boxes(splats, footprints, count, capacity, grid))
+    return ViewSplats(splats, footprints, values, radii, make_boxes(splats, footprints, view.count, capacity, grid))
 
 
 def list_view(
-    rows: list[Float],
-    camera: Pinhole,
-    degree: int,
-    settings: ViewSettings,
-    watched: bool,
-    count: UInt32,
-    limit: UInt32,
-    capacities: Capacities,
-    grid: Grid,
+    view: ViewRequest, limit: UInt32, capacities: Capacities, grid: Grid
 ) -> tuple[Splats, dict[str, list[Float]], Float | None, TileLists, UInt32 | UInt64]:
     """Of `find_view_boxes` the splats, what is blended, and radii; lists of these capacities; the boxes' `pair_ends`.
     The lists are empty where there are more pairs than `limit`."""
-    drawn = find_view_boxes(rows, camera, degree, settings, watched, count, capacities.splats, grid)
+    drawn = find_view_boxes(view, capacities.splats, grid)
     assert drawn.boxes.pair_ends is not None
     lists = make_lists(drawn.footprints, drawn.boxes, limit, capacities, grid)
     return drawn.splats, drawn.values, drawn.radii, lists, drawn.boxes.pair_ends

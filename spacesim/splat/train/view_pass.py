@@ -28,7 +28,7 @@ from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
     LossSettings,
     TargetImage,
-    ViewSettings,
+    ViewRequest,
     ViewSplats,
     find_view_boxes,
     list_view,
@@ -118,7 +118,6 @@ class ViewPass:
         factors = [2**power for power in range(config.num_downscales + 1)]
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
-        self._settings = ViewSettings(config.antialiased, config.shape_terms, scale)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
@@ -138,21 +137,24 @@ class ViewPass:
         self.pairs.pending.clear()  # of a step that was interrupted
         camera, pairs = self._camera(view.camera, downscale), self.pairs.of_view("picture", view.index)
         extent = Extent(gaussians.count, camera.width, camera.height, training=True)
-        asked, grid = (rows, camera, degree, self._settings, watched, extent.live), extent.grid
+        config, grid = self.config, extent.grid
+        asked = ViewRequest(
+            rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched, extent.live
+        )
         expected = pairs.expected(extent)
         drawn: ViewSplats | None = None
         if expected is None:
-            drawn = self._find_boxes(*asked, extent.most, grid)
+            drawn = self._find_boxes(asked, extent.most, grid)
             splats, values, radii = drawn.splats, drawn.values, drawn.radii
         else:
             limit, capacities = held(expected, "pairs"), extent.capacities(expected)
-            splats, values, radii, lists, pair_ends = self._list(*asked, limit, capacities, grid)
+            splats, values, radii, lists, pair_ends = self._list(asked, limit, capacities, grid)
             pairs.check(extent, pair_ends, expected)
         of_sun = self.pairs.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
         if shading:
             values["color"] = shading.colors
-            if self.config.visibility_weight > 0 and shading.visibility is not None:
+            if config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
         if drawn is not None:  # after shading, which needs memory of its own
             lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
