@@ -208,7 +208,17 @@ def _read_frames(source: Path, meta: Json, needed: bool = True) -> tuple[tuple[F
         others = "" if there else ", nor one of any other frame"
         raise InputError(f"{source}: frame {missing[0]}: expected an image file, found none{others}")
     frames = [_read_frame(source, meta, entry, path) for path, entry in named if path in there]
+    numbers = {path for path, entry in named if isinstance(entry.get("exposure"), int | float)}
+    unread = [frame.file_path for frame in frames if frame.file_path in numbers and frame.exposure is None]
+    if unread:
+        _log.warning("%s: exposure of %d frames (%s first) is not above 0, so not read", source, len(unread), unread[0])
     return tuple(frames), missing
+
+
+def _exposure(entry: Json) -> float | None:
+    """Of a frame, a factor; None for other values: others mean all kinds of things by the key."""
+    value = entry.get("exposure")
+    return float(value) if isinstance(value, int | float) and 0 < value < math.inf else None
 
 
 def image_path(source: Path, entry: Json) -> str:
@@ -233,8 +243,7 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
     paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
-    exposure = entry.get("exposure")  # others mean all kinds of things by it
-    own = float(exposure) if isinstance(exposure, int | float) and 0 < exposure < math.inf else None
+    own = _exposure(entry)
     return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion, exposure=own, objects=objects)
 
 

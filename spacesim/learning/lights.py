@@ -62,6 +62,8 @@ def named_sources(run: CanPredict, sun: Named, earth: Named, of_frame: Sun | Non
         found = Sun(found.direction, shown)
     if light == "earth":
         _check_knows_earth(run, "sun")
+        if earth == "none":
+            raise InputError("sun: expected AZ,EL where the Earth gives no light, found none")
         if found is None or shown is None:
             raise InputError("sun: expected AZ,EL where no frame says which Sun lights which Earth, found none")
     return found, light

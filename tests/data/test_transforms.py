@@ -1,6 +1,7 @@
 """Folders from elsewhere: Nerfstudio's rules, Blender's pair, and hostile input."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -67,6 +68,20 @@ def test_frames_without_an_image_are_left_out_with_one_warning(tmp_path, caplog)
     assert [problem.split(":")[0] for problem in find_unreadable_files(tmp_path)] == [
         str(tmp_path / name) for name in dataset.missing
     ]
+
+
+def test_exposures_that_are_no_factors_are_named(tmp_path, caplog):
+    """What is no number means something else to others."""
+    values = [1e-4, 0, -1.0, math.nan, math.inf, "f/8", None]
+    names = [f"{k}.png" for k in range(len(values))]
+    path = write_folder(tmp_path, names, test_filenames=names[-1:]) / "transforms.json"
+    meta = json.loads(path.read_text())
+    for frame, value in zip(meta["frames"], values, strict=True):
+        frame["exposure"] = value
+    path.write_text(json.dumps(meta))
+    dataset = read_dataset(tmp_path)
+    assert [frame.exposure for frame in (*dataset.train, *dataset.test)] == [1e-4, *[None] * 6]
+    assert "exposure of 4 frames (1.png first) is not above 0, so not read" in caplog.text
 
 
 def test_intrinsics_of_the_frame_win(tmp_path):

@@ -44,14 +44,10 @@ class LightConfig:
         check_fields(self)
         if not 0 <= self.bounce <= MAX_EMITTERS:
             raise InputError(f"bounce: expected 0 to {MAX_EMITTERS}, found {self.bounce}")
-        if self.bounce and not self.field.surface:
-            kind = "a field that takes directions"
-            raise InputError(f"bounce: expected 0 or light.field.inputs=surface, whose normals it needs, found {kind}")
-        if self.earth and not self.field.surface:
-            kind = "a field that takes directions"
-            raise InputError(
-                f"earth: expected false or light.field.inputs=surface, whose normals it needs, found {kind}"
-            )
+        for name, value, off in (("bounce", self.bounce, "0"), ("earth", self.earth, "false")):
+            if value and not self.field.surface:
+                needed = "light.field.inputs=surface, whose normals it needs"
+                raise InputError(f"{name}: expected {off} or {needed}, found {self.field.inputs.kind}")
         if self.shadow and not self.field.knows_sun:
             raise InputError("field: expected inputs with the Sun, which casts shadows, found view")
         for name in ("tone", "exposure"):

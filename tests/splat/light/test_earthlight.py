@@ -23,7 +23,7 @@ from spacesim.splat.compose.plain import bake_scene
 from spacesim.splat.compose.pose import Pose
 from spacesim.splat.compose.scene import GaussianComposition, PlacedRun
 from spacesim.splat.light.config import LightConfig
-from spacesim.splat.light.field import FieldConfig
+from spacesim.splat.light.field import FieldConfig, ViewAloneConfig
 from spacesim.splat.pose.picture import SunlitRun
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
@@ -251,7 +251,7 @@ def test_render_draws_the_layers(spacesim, run, earthlit, tmp_path):
     refused = spacesim(
         "render", run.path, "--frame", 16, "--earth", "none", "--sun", "none", "--out", tmp_path / "b.png"
     )
-    assert refused.is_refusal("--sun", "no frame says")
+    assert refused.is_refusal("--sun", "where the Earth gives no light")
 
 
 def test_a_scene_is_evaluated_in_the_light_of_its_data(spacesim, run, earthlit, tmp_path):
@@ -340,9 +340,20 @@ def test_an_earth_that_gives_no_light_is_not_learned(small_lit_dataset, tmp_path
     assert f"the frames of {dataset.root} name several Earths, none of which hides the Sun here" in caplog.text
 
 
+def test_frames_that_name_no_earth_among_others_are_named(small_lit_dataset, tmp_path, caplog):
+    """One that names none leaves the Earth out of the model, which is said."""
+    first, *others = small_lit_dataset.train
+    lit = [replace(frame, sun=replace(frame.sun, earth=Earth(-frame.sun.direction))) for frame in others]
+    run = train(replace(small_lit_dataset, train=(first, *lit)), tmp_path / "run", replace(CONFIG, iterations=1))
+    assert not run.knows_earth
+    assert f"without the Earth's light: {first.file_path} names no Earth that gives some, others do" in caplog.text
+
+
 def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
-    with pytest.raises(InputError, match=r"earth: expected false or light\.field\.inputs=surface"):
+    with pytest.raises(InputError, match=r"earth: expected false or light\.field\.inputs=surface.*, found directions"):
         LightConfig(FieldConfig(), earth=True)
+    with pytest.raises(InputError, match=r"bounce: expected 0 or light\.field\.inputs=surface.*, found view"):
+        LightConfig(FieldConfig(inputs=ViewAloneConfig()), bounce=64)
     needed = with_settings(CONFIG, {"light.earth": True})
     with pytest.raises(InputError, match=r"expected earth_direction in every training frame .*, found none in images/"):
         train(small_lit_dataset, tmp_path / "run", needed)
