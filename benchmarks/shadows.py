@@ -115,7 +115,11 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, bilinear", with_shadow(mapped, method=MappingConfig())
     yield "map, surface, offset receivers alone", with_shadow(mapped, grazing="lift")
     yield "splat, surface, offset receivers alone", with_shadow(splatted, grazing="lift")
-    yield "map, surface, no refinement", with_shadow(mapped, refine=None)
+    for name, config in (("map", mapped), ("splat", splatted)):
+        yield f"{name}, surface, no refinement", with_shadow(config, refine=None)
+    half = shadow_of(splatted).size // 2
+    yield "splat, surface, light of half the size", with_shadow(splatted, size=half)
+    yield "splat, surface, a quarter of the emitters", with_bounce(splatted, light_of(splatted).bounce // 4)
     yield "map, surface, percentage-closer", with_shadow(mapped, method=MappingConfig("percentage-closer"))
     other = "median" if size == "fine" else "variance"
     yield f"map, surface, {other}", with_settings(mapped, {"light.shadow.method": {"filter": other}})
