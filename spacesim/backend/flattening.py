@@ -1,4 +1,4 @@
-"""Code that takes the arrays out of a call's arguments, written for arguments of one structure.
+"""Code for one structure that takes the arrays out of a call's arguments, or makes its result of arrays.
 
 Recorded functions are called with dozens of arrays in lists and records. To look at each thing for what it is takes as
 long as to launch the kernels; straight code for what is expected takes a third of that.
@@ -103,6 +103,51 @@ class _Code:
         name = f"c{len(self.scope)}"
         self.scope[name] = value
         return name
+
+
+class Joining:
+    """Code that makes what is like a value of other arrays, its own being those of `arrays`, in order."""
+
+    def __init__(self, value: Any, plain: Collection[type], names_of_fields: FieldNames) -> None:
+        """plain: types of what stays as it is"""
+        self.plain, self.names_of_fields = plain, names_of_fields
+        self.arrays: list[Any] = []
+        self._constants: list[Any] = []
+        self._code = self._expression(value)
+
+    @property
+    def key(self) -> object:
+        """Equal for values for which the code is the same."""
+        return self._code, tuple((type(value), repr(value)) for value in self._constants)
+
+    def function(self) -> Callable[[list[Any]], Any]:
+        """Of as many arrays as there are in `arrays`."""
+        joined: Callable[[list[Any]], Any] = eval(
+            f"lambda arrays: {self._code}", {f"c{i}": value for i, value in enumerate(self._constants)}
+        )
+        return joined
+
+    def _expression(self, value: Any) -> str:
+        kind = type(value)
+        if kind in self.plain:
+            return self._constant(value)
+        if kind is list or kind is tuple:
+            parts = "".join(f"{self._expression(part)}, " for part in value)
+            return f"[{parts}]" if kind is list else f"({parts})"
+        if kind is dict:
+            parts = "".join(f"{self._constant(key)}: {self._expression(part)}, " for key, part in value.items())
+            return f"{{{parts}}}"
+        names = self.names_of_fields(kind)
+        if names is None:
+            self.arrays.append(value)
+            return f"arrays[{len(self.arrays) - 1}]"
+        parts = "".join(f"{name}={self._expression(getattr(value, name))}, " for name in names)
+        return f"{self._constant(kind)}({parts})"
+
+    def _constant(self, value: Any) -> str:
+        """A name for it in the code."""
+        self._constants.append(value)
+        return f"c{len(self._constants) - 1}"
 
 
 def size_of(value: object, names_of_fields: FieldNames) -> int:

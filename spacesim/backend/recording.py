@@ -10,14 +10,14 @@ from functools import cache, update_wrapper
 from operator import attrgetter
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
-from spacesim.backend.flattening import FEW, Flatten, flattener, size_of
+from spacesim.backend.flattening import FEW, Flatten, Joining, flattener, size_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
 RECENT = 4  #: structures that a call's arguments may have, before it is walked through for what it has
 RECORDINGS = 256  #: of a function that are kept: one for each size of picture, of the lists, and of the model
 
-_PLAIN = frozenset((int, float, bool, str, type(None)))
+_PLAIN: frozenset[type] = frozenset((int, float, bool, str, type(None)))
 _EQUAL_TO_INTEGERS = frozenset((float, bool))  # 1, 1.0 and True are one key of a dictionary, 0.0 and -0.0 too
 MAX_KEYS = 2**14  # that are remembered of what is not an array
 _constants: dict[int, tuple[Any, Any]] = {}  # frozen dataclasses without arrays, by `id`: what `_split` gave for them
@@ -73,9 +73,11 @@ class Recorded(Generic[P, R]):
 
     Arguments may be arrays, numbers and texts, and tuples, lists, dicts and dataclasses of them. Dr.Jit 1.5 takes
     long to walk through these, knows an argument that occurs twice in a call by identity, and takes f(1, 2, 1) for
-    f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest. No array may stand in two places. What
-    Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and recordings differ by whether
-    it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`backend.upload`).
+    f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest, and gives the like, as it would make
+    records while it holds its lock: another thread that Python lets run then would wait for that for ever. No array may
+    stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and
+    recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them
+    (`backend.upload`).
     Python's garbage collector waits during a call: arrays that it frees in the middle of a recording end the process.
     Other threads' calls, of any such function, wait as well: a recording takes in what they do.
 
@@ -120,7 +122,8 @@ class Recorded(Generic[P, R]):
         collecting = gc.isenabled()
         gc.disable()
         try:
-            result: R = self._frozen(name, arrays)
+            name, arrays = self._frozen(name, arrays)
+            result: R = now.results[name](arrays)
             return result
         finally:
             now.arguments, now.named = (), {}
@@ -164,12 +167,22 @@ class _Arguments:
         self.arguments: tuple[Any, ...] = ()
         self.named: dict[str, Any] = {}
 
-    def trace(self, arrays: list[Any]) -> Any:
-        """Call the function with `arrays` in place of the arguments' own."""
+        self.results: dict[str, Callable[[list[Any]], Any]] = {}  # what makes results of arrays, by name
+        self._names_of_results = _Names()
+
+    def trace(self, arrays: list[Any]) -> tuple[str, list[Any]]:
+        """Call the function with `arrays` in place of the arguments' own. Returns what its result is, a name of
+        `results`, and the result's arrays."""
         global _recordings
         _recordings += 1
         rest = iter(arrays)
-        return self.function(*_joined(self.arguments, rest), **_joined(self.named, rest))
+        result = Joining(
+            self.function(*_joined(self.arguments, rest), **_joined(self.named, rest)), _PLAIN, _field_names
+        )
+        name = self._names_of_results[result.key]
+        if name not in self.results:
+            self.results[name] = result.function()
+        return name, result.arrays
 
 
 class _Names(dict[Any, str]):
