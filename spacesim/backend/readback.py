@@ -38,12 +38,11 @@ _SHARED = 1  # memory that the host reads and the device writes; on CUDA its pag
 
 
 class AsyncNumber:
-    """Entry `index`, by default the last, of an evaluated array UInt32 or UInt64 [N], read once with `wait`, by the
-    thread that made it."""
+    """The last entry of an evaluated array UInt32 or UInt64 [N], read once with `wait`, by the thread that made it."""
 
-    def __init__(self, array: UInt32 | UInt64, index: int | None = None) -> None:
+    def __init__(self, array: UInt32 | UInt64) -> None:
         """Raises RuntimeError where `can_read_async` is false."""
-        self._copy = _Copy(array, load_drjit().width(array) - 1 if index is None else index, 1)
+        self._copy = _Copy(array, load_drjit().width(array) - 1, 1)
 
     def wait(self) -> int:
         """The number. Waits for what was asked of the device before this was made, and for nothing else."""

@@ -6,15 +6,17 @@ as given, and so do shadows, as in the literature.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeVar
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.last_made import LastMade
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
@@ -35,6 +37,7 @@ from spacesim.splat.raster.lists.capacity import WAITING, PairCounts
 from spacesim.splat.raster.lists.pictures import computed
 
 log = logging.getLogger(__name__)
+Made = TypeVar("Made")
 
 ANY_SUN = np.array([0.0, 0.0, 1.0])  #: stands for an unknown Sun, in a model that does not take it
 MANY_RAYS = 1e7  #: which take seconds on a CPU
@@ -69,27 +72,9 @@ class Shading:
 class _PictureCache:
     """What pictures of one model have in common."""
 
-    read: list[Float]  #: the arrays that it was made of
     first_layer: mlp.PartialLayer | None  #: what the field's first layer makes of the features
     packed: cooperative.PackedNetwork  #: the field's network for `cooperative`, [] where `first_layer` serves
     embedding: list[Float]  #: the mean one, Float [E] in a list, or nothing
-
-
-@dataclass
-class _Around:
-    """What the Gaussians that were looked at last see around them: their light changes more often than they do."""
-
-    read: list[Float]  #: the arrays that it was made of
-    surroundings: Surroundings | None
-
-
-@dataclass
-class _LastSunlight:
-    """The Sun that was asked for last: cameras move more often than it does."""
-
-    read: list[Float] = field(default_factory=list)  #: the arrays that it was made of
-    asked: tuple[bytes | None, ...] = ()  #: its direction, the embedding
-    sunlight: Sunlight = field(default_factory=lambda: Sunlight(None, []))  #: what it was
 
 
 @dataclass
@@ -117,11 +102,11 @@ class LightModel:
         self.config, self.weights, self.frame, self.embeddings = config, weights, frame, embeddings
         self._training_frame = ad.Float([*np.asarray(frame.centre, np.float32), frame.scale])
         self._encodings = lru_cache(maxsize=SUNS)(self._encode_sun)
-        self._cache = _PictureCache([], None, [], [])
-        self._around = _Around([], None)
+        self._of_pictures: LastMade[_PictureCache] = LastMade()
+        self._around: LastMade[Surroundings] = LastMade()  # light changes more often than Gaussians do
+        self._sunlight: LastMade[Sunlight] = LastMade()  # cameras move more often than the Sun does
         self._held: HeldSurroundings | None = None
         self._told = False  # that rays take long in training
-        self._last_sunlight = _LastSunlight()
 
     @staticmethod
     def initial(config: LightConfig, frame: TrainingFrame, seed: int, pictures: int = 0) -> "LightModel":
@@ -180,12 +165,13 @@ class LightModel:
                 self._told = self._tell_of_rays(gaussians.count, "now and then in training")
             return self._held.surroundings(self.config.bounce, self.frame.radius, gaussians.count)
         read = [*gaussians.rows()[:GEOMETRY], _features(gaussians)]
-        if self._around.surroundings is None or not _are_same(read, self._around.read):
-            self._around = _Around([], None)  # frees memory for the next
+        around = self._around.find(read)
+        if around is None:
             self._tell_of_rays(gaussians.count, "once for all pictures")
             surfaces = Surfaces.of(gaussians, self.config.field.features)
-            self._around = _Around(_kept(read), look_around(surfaces, self.config.bounce, self.frame.radius))
-        return self._around.surroundings
+            around = look_around(surfaces, self.config.bounce, self.frame.radius)
+            self._around.keep(around, read)
+        return around
 
     def _tell_of_rays(self, count: int, when: str) -> bool:
         """Of so many Gaussians, where they take long. Returns whether they do."""
@@ -200,14 +186,15 @@ class LightModel:
         these do, or those of a checkpoint, until this is called again."""
         if isinstance(of, Gaussians):
             of = HeldSurroundings(Surfaces.of(of, self.config.field.features))
-        self._held, self._around = of, _Around([], None)
-        self._last_sunlight = _LastSunlight()  # its emitters have other numbers
+        self._held = of
+        self._around.forget()
+        self._sunlight.forget()  # its emitters have other numbers
 
     def follow(self, source: UInt32) -> None:
         """Each Gaussian was `source` [N] of those before: it sees what that one saw."""
         if self._held:
             self._held.follow(source)
-            self._last_sunlight = _LastSunlight()
+            self._sunlight.forget()
 
     @property
     def held_surroundings(self) -> HeldSurroundings | None:
@@ -217,28 +204,31 @@ class LightModel:
     def sunlight(self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None = None) -> Sunlight:
         """Visibility, and light that bounces, under one Sun, for any number of pictures; at once where it was asked for
         last and nothing has changed. embedding: as `shade_picture` takes it"""
-        return self._remembered(computed(lambda pairs: self._sunlight(gaussians, sun, embedding, pairs)))
+        return self._with_sunlight(gaussians, sun, embedding, lambda light: light)
 
-    def _remembered(self, last: _LastSunlight) -> Sunlight:
-        if last.read:
-            self._last_sunlight = last
-        return last.sunlight
-
-    def _sunlight(
-        self, gaussians: Gaussians, sun: np.ndarray | None, embedding: np.ndarray | None, pairs: PairCounts
-    ) -> _LastSunlight:
-        """What was asked for last, where that is asked for; `_remembered` keeps what holds."""
-        if self.config.shadow is None and not self.config.bounce:
-            return _LastSunlight()
+    def _with_sunlight(
+        self,
+        gaussians: Gaussians,
+        sun: np.ndarray | None,
+        embedding: np.ndarray | None,
+        use: Callable[[Sunlight], Made],
+    ) -> Made:
+        """What `use` makes of the light of `sunlight`."""
         read = [*gaussians.rows(), *self.weights, *self.embeddings]
         asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
-        last, changes = self._last_sunlight, dr.grad_enabled(read)
+        changes = dr.grad_enabled(read)
+        last = None if changes else self._sunlight.find(read, asked)
+        if last is not None:
+            return use(last)
+
+        def under_sun(pairs: PairCounts) -> tuple[Sunlight, Made]:
+            light = self.arriving(gaussians, sun, self._visibility(gaussians, sun, pairs), embedding)
+            return light, use(light)
+
+        light, made = computed(under_sun)
         if not changes:
-            if asked == last.asked and _are_same(read, last.read):
-                return last
-            self._last_sunlight = _LastSunlight()  # frees memory for the next
-        sunlight = self.arriving(gaussians, sun, self._visibility(gaussians, sun, pairs), embedding)
-        return _LastSunlight([] if changes else _kept(read), asked, sunlight)
+            self._sunlight.keep(light, read, asked)
+        return made
 
     def visibility(self, gaussians: Gaussians, sun: np.ndarray | None) -> Float | None:
         """Of `sunlight`, without what bounces."""
@@ -283,16 +273,11 @@ class LightModel:
         `sunlight` or `arriving`;  embedding: [E] of the picture, None: the mean one;  earth: see `encode_sun`. What
         the field's first layer makes of the features does not change with Sun or camera and stays for the next
         picture: as many numbers for each Gaussian as the layer has units."""
-        if sunlight is not None:
-            return self._shown(gaussians, camera, sun, sunlight, embedding, earth)
 
-        def under_sun(pairs: PairCounts) -> tuple[_LastSunlight, tuple[list[Float], Float | None]]:
-            last = self._sunlight(gaussians, sun, embedding, pairs)
-            return last, self._shown(gaussians, camera, sun, last.sunlight, embedding, earth)
+        def shown(light: Sunlight) -> tuple[list[Float], Float | None]:
+            return self._shown(gaussians, camera, sun, light, embedding, earth)
 
-        last, shown = computed(under_sun)
-        self._remembered(last)
-        return shown
+        return self._with_sunlight(gaussians, sun, embedding, shown) if sunlight is None else shown(sunlight)
 
     def _shown(
         self,
@@ -418,13 +403,14 @@ class LightModel:
         of_field, _ = split_weights(self.config, self.weights)
         is_cooperative = select() in COOPERATIVE and cooperative.is_usable()
         read = [*(of_field if is_cooperative else [features, of_field[1]]), *self.embeddings]
-        if not _are_same(read, self._cache.read):
-            self._cache = _PictureCache([], None, [], [])  # frees memory for the next
+        cache = self._of_pictures.find(read)
+        if cache is None:
             field = self.config.field
             packed = cooperative.pack(field.shape, of_field) if is_cooperative else []
             first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)
-            self._cache = _PictureCache(_kept(read), first_layer, packed, self._mean_embedding())
-        return self._cache
+            cache = _PictureCache(first_layer, packed, self._mean_embedding())
+            self._of_pictures.keep(cache, read)
+        return cache
 
     def _encode_sun(self, earth: Earth | None, *sun: float) -> SunEncoding:
         refine = self.config.refine or self.config.field
@@ -436,16 +422,6 @@ class LightModel:
         terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams, eclipse)
         dr.eval(terms)
         return terms
-
-
-def _kept(arrays: Sequence[Float]) -> list[Float]:
-    """To compare others with, see `_are_same`: a number of Dr.Jit's that is in use is never another array's."""
-    return [ad.Float(array) for array in arrays]
-
-
-def _are_same(arrays: Sequence[Float], kept: Sequence[Float]) -> bool:
-    """Whether these are the arrays that `_kept` was given: the same ones, not equal ones."""
-    return [array.index for array in arrays] == [array.index for array in kept]
 
 
 def _features(gaussians: Gaussians) -> Float:
