@@ -805,8 +805,8 @@ def test_data_like_speedplus_have_suns_only_in_the_labels(command, place):
 
 
 @smallest(
-    "earth.py --out OUT --suns 3 --views 2 --resolution 24 --spp 2 --method relight --iterations 2 --seed 1"
-    " --backend llvm --json"
+    "earth.py --out OUT --suns 3 --views 2 --resolution 24 --spp 2 --method relight --preset demo"
+    " --iterations 2 --seed 1 --backend llvm --json"
 )
 def test_the_earths_light_is_told_from_the_suns(command, place):
     without, known = json.loads(call(command))["rows"]
