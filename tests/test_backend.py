@@ -374,6 +374,8 @@ from dataclasses import dataclass
 import drjit as dr
 from spacesim import backend
 from spacesim.backend.arrays import Float
+from spacesim.learning.mlp import MlpShape
+from spacesim.splat.light import cooperative
 
 faulthandler.dump_traceback_later(60, exit=True)
 ad, done = backend.ad, threading.Event()
@@ -384,7 +386,7 @@ class Pair:
     rest: object
 
 @backend.recorded
-def both(x):
+def both(x, network):
     return Pair(x + 1, Pair([2 * x], {"three": 3 * x}))
 
 def work():
@@ -396,8 +398,9 @@ sys.setswitchinterval(1e-6)
 for thread in threads:
     thread.start()
 x = dr.arange(ad.Float, 100)
+network = cooperative.pack(MlpShape(2, 1, 1, 4, 2), [dr.zeros(ad.Float, n) for n in (4, 8, 4, 4, 1)])
 for _ in range(20_000):
-    found = both(x)
+    found = both(x, network)
 done.set()
 for thread in threads:
     thread.join()
@@ -405,8 +408,9 @@ print(found.rest.rest["three"].numpy().sum(), len(found.rest.first))
 """
 
 
-def test_recordings_that_give_records_do_not_wait_for_threads_that_wait_for_them():
-    """Dr.Jit holds its lock while it puts a result together, and other threads, with Python's, wait for that."""
+def test_recordings_do_not_wait_for_threads_that_wait_for_them():
+    """Dr.Jit holds its lock while it looks into arguments and puts results together: what runs Python there lets others
+    run, which wait for that with Python's lock."""
     assert run(OTHER_THREADS).split() == ["14850.0", "1"]
 
 

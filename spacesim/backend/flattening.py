@@ -115,11 +115,6 @@ class Joining:
         self._constants: list[Any] = []
         self._code = self._expression(value)
 
-    @property
-    def key(self) -> object:
-        """Equal for values for which the code is the same."""
-        return self._code, tuple((type(value), repr(value)) for value in self._constants)
-
     def function(self) -> Callable[[list[Any]], Any]:
         """Of as many arrays as there are in `arrays`."""
         joined: Callable[[list[Any]], Any] = eval(

@@ -74,10 +74,10 @@ class Recorded(Generic[P, R]):
     Arguments may be arrays, numbers and texts, and tuples, lists, dicts and dataclasses of them. Dr.Jit 1.5 takes
     long to walk through these, knows an argument that occurs twice in a call by identity, and takes f(1, 2, 1) for
     f(1, 2, 2): it gets a flat list of the arrays and one text for all the rest, and gives the like, as it would make
-    records while it holds its lock: another thread that Python lets run then would wait for that for ever. No array may
-    stand in two places. What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and
-    recordings differ by whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them
-    (`backend.upload`).
+    records while it holds its lock: another thread that Python lets run then would wait for that for ever. So does what
+    it looks into and is no array of its own, an `Enum` say: no argument may hold one. No array may stand in two places.
+    What Dr.Jit's LLVM backend makes of a numpy array is numpy's own memory, whose kernels and recordings differ by
+    whether it happens to begin at a multiple of 64 bytes: make arguments of lists, or copy them (`backend.upload`).
     Python's garbage collector waits during a call: arrays that it frees in the middle of a recording end the process.
     Other threads' calls, of any such function, wait as well: a recording takes in what they do.
 
@@ -122,8 +122,8 @@ class Recorded(Generic[P, R]):
         collecting = gc.isenabled()
         gc.disable()
         try:
-            name, arrays = self._frozen(name, arrays)
-            result: R = now.results[name](arrays)
+            join, arrays = self._frozen(name, arrays)
+            result: R = join(arrays)
             return result
         finally:
             now.arguments, now.named = (), {}
@@ -167,22 +167,15 @@ class _Arguments:
         self.arguments: tuple[Any, ...] = ()
         self.named: dict[str, Any] = {}
 
-        self.results: dict[str, Callable[[list[Any]], Any]] = {}  # what makes results of arrays, by name
-        self._names_of_results = _Names()
-
-    def trace(self, arrays: list[Any]) -> tuple[str, list[Any]]:
-        """Call the function with `arrays` in place of the arguments' own. Returns what its result is, a name of
-        `results`, and the result's arrays."""
+    def trace(self, arrays: list[Any]) -> tuple[Callable[[list[Any]], Any], list[Any]]:
+        """Call the function with `arrays` in place of the arguments' own. Returns what makes its result of arrays, a
+        constant of the recording, and the result's arrays."""
         global _recordings
         _recordings += 1
         rest = iter(arrays)
-        result = Joining(
-            self.function(*_joined(self.arguments, rest), **_joined(self.named, rest)), _PLAIN, _field_names
-        )
-        name = self._names_of_results[result.key]
-        if name not in self.results:
-            self.results[name] = result.function()
-        return name, result.arrays
+        result = self.function(*_joined(self.arguments, rest), **_joined(self.named, rest))
+        joining = Joining(result, _PLAIN, _field_names)
+        return joining.function(), joining.arrays
 
 
 class _Names(dict[Any, str]):

@@ -5,6 +5,7 @@ LLVM they compute the same more slowly. Not everywhere where CUDA is there is Op
 """
 
 import logging
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -21,9 +22,35 @@ from spacesim.splat.light.padded_batch import PaddedBatch
 
 AGREES = 2e-3  #: difference to single precision up to which `is_usable` accepts a network's sigmoid
 
-PackedNetwork = list["nn.MatrixView"]  #: matrix, bias, matrix, bias, ..., see `pack`
+PLACE = "layout", "shape", "offset", "size", "stride", "transpose"  #: what a view has beside numbers and their type
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the matrices and biases of a network stand, a record that recordings know as a whole."""
+
+    views: tuple[tuple[Any, ...], ...]  #: of matrix, bias, matrix, bias, ...: each its `PLACE`
+
+
+@dataclass(frozen=True, eq=False)
+class PackedNetwork:
+    """See `pack`. Not `nn.MatrixView`s, whose type of numbers is an `Enum`: see `Recorded`."""
+
+    numbers: Any  #: Float16, of all matrices and biases
+    places: Places  #: in them
+
+    def views(self) -> list["nn.MatrixView"]:
+        """Matrix, bias, matrix, bias, ..."""
+        found = []
+        for place in self.places.views:
+            view = nn.MatrixView()
+            view.buffer, view.dtype = self.numbers, dr.type_v(self.numbers)
+            for name, value in zip(PLACE, place, strict=True):
+                setattr(view, name, value)
+            found.append(view)
+        return found
 
 
 def pack(shape: MlpShape, weights: list[Float]) -> PackedNetwork:
@@ -37,15 +64,17 @@ def pack(shape: MlpShape, weights: list[Float]) -> PackedNetwork:
             matrix = np.concatenate([np.array(weights[0]).reshape(rows, shape.shared), matrix], axis=1)
         parts += [ad.TensorXf16(matrix.astype(np.float16)), ad.Float16(bias.astype(np.float16))]
     views: Any = nn.pack(parts, layout="inference")
-    return list(views)
+    places = tuple(tuple(getattr(view, name) for name in PLACE) for view in views)
+    return PackedNetwork(views[0].buffer, Places(places))
 
 
 def forward(shape: MlpShape, packed: PackedNetwork, rows: list[Float], shared: Float) -> list[Float]:
     """Outputs, Floats [M], of inputs `rows`, Floats [M] or of width 1.  packed: see `pack`;  shared: Float [shared]"""
     shared_inputs = [dr.gather(ad.Float, shared, ad.UInt32(i)) for i in range(shape.shared)]
+    views = packed.views()
     value: Any = nn.CoopVec([ad.Float16(row) for row in [*shared_inputs, *rows]])
     for i in range(shape.layers):
-        value = nn.matvec(packed[2 * i], value, packed[2 * i + 1])
+        value = nn.matvec(views[2 * i], value, views[2 * i + 1])
         if i < shape.layers - 1:
             value = dr.maximum(value, 0)
     return [ad.Float(output) for output in value]

@@ -73,7 +73,7 @@ class _PictureCache:
     """What pictures of one model have in common."""
 
     first_layer: mlp.PartialLayer | None  #: what the field's first layer makes of the features
-    packed: cooperative.PackedNetwork  #: the field's network for `cooperative`, [] where `first_layer` serves
+    packed: cooperative.PackedNetwork | None  #: the field's network for `cooperative`, None where `first_layer` serves
     embedding: list[Float]  #: the mean one, Float [E] in a list, or nothing
 
 
@@ -214,6 +214,8 @@ class LightModel:
         use: Callable[[Sunlight], Made],
     ) -> Made:
         """What `use` makes of the light of `sunlight`."""
+        if self.config.shadow is None and not self.config.bounce:
+            return use(Sunlight(None, []))
         read = [*gaussians.rows(), *self.weights, *self.embeddings]
         asked = tuple(None if numbers is None else np.asarray(numbers).tobytes() for numbers in (sun, embedding))
         changes = dr.grad_enabled(read)
@@ -406,7 +408,7 @@ class LightModel:
         cache = self._of_pictures.find(read)
         if cache is None:
             field = self.config.field
-            packed = cooperative.pack(field.shape, of_field) if is_cooperative else []
+            packed = cooperative.pack(field.shape, of_field) if is_cooperative else None
             first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)
             cache = _PictureCache(first_layer, packed, self._mean_embedding())
             self._of_pictures.keep(cache, read)

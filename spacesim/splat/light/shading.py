@@ -115,13 +115,14 @@ def shade_picture(
     inputs: ShadingInputs,
     batch: PaddedBatch,
     first_layer: mlp.PartialLayer | None,
-    packed: cooperative.PackedNetwork,
+    packed: cooperative.PackedNetwork | None,
     sunlight: Sunlight,
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
     field, field_inputs = config.field, _field_inputs(inputs)
     views = field_views(field, field_inputs, batch)
-    if first_layer:
+    if packed is None:
+        assert first_layer is not None, "one of the two"
         items = batch.matrix(views, round_up_rows(len(views)))
         output, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
         outputs = [batch.row(output, i) for i in range(3)]
