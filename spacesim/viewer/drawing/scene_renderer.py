@@ -1,8 +1,8 @@
 """The models that are shown, and their planes under any camera, Sun and poses.
 
-Only the render thread draws: a recorded call holds Dr.Jit's lock while it runs Python, so that another thread that asks
-Dr.Jit for anything at all, be it the length of an array, would wait for it for ever, and keep Python from going on. All
-that others ask of a `SceneRenderer` is therefore found out when it is made.
+Only the render thread draws: should Dr.Jit run Python while it holds its lock (see `Recorded`), another thread that
+asks it for anything at all, be it the length of an array, would wait for ever, and keep Python from going on. All that
+others ask of a `SceneRenderer` is therefore found out when it is made.
 """
 
 from collections.abc import Callable, Sequence
