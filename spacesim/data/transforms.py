@@ -215,12 +215,6 @@ def _read_frames(source: Path, meta: Json, needed: bool = True) -> tuple[tuple[F
     return tuple(frames), missing
 
 
-def _exposure(entry: Json) -> float | None:
-    """Of a frame, a factor; None for other values: others mean all kinds of things by the key."""
-    value = entry.get("exposure")
-    return float(value) if isinstance(value, int | float) and 0 < value < math.inf else None
-
-
 def image_path(source: Path, entry: Json) -> str:
     """Of a frame, relative to the folder of `source`."""
     file_path = _path(source, entry, "file_path")
@@ -243,7 +237,8 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     except InputError as error:
         raise InputError(f"{source}: frame {file_path}: {error}") from None
     paths = {key: _path(source, entry, key) for key in TRUTH_PATHS}
-    own = _exposure(entry)
+    exposure = entry.get("exposure")  # others mean all kinds of things by it
+    own = float(exposure) if isinstance(exposure, int | float) and 0 < exposure < math.inf else None
     return Frame(file_path, camera, sun, **paths, time=time, distortion=distortion, exposure=own, objects=objects)
 
 

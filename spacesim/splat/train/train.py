@@ -128,15 +128,16 @@ def _with_light_of(config: TrainConfig, dataset: Dataset) -> TrainConfig:
     light = config.light
     if light is None:
         return config
-    earths = [(frame.file_path, frame.sun.earth if frame.sun else None) for frame in dataset.train]
-    dark = next((path for path, earth in earths if earth is None or earth.albedo == 0), None)
-    if light.earth and dark is not None:
+    earths = ((frame.file_path, frame.sun.earth if frame.sun else None) for frame in dataset.train)
+    dark = [path for path, earth in earths if earth is None or earth.albedo == 0]
+    if light.earth and dark:
         expected = "expected earth_direction in every training frame (light.earth = true), with earth_albedo above 0"
-        raise InputError(f"{dataset.root}: {expected}, found none in {dark}")
-    if light.field.surface and dark is None and light.earth is None:
-        light = replace(light, earth=True)
-    if light.field.surface and dark is not None and light.earth is None and any(earth for _, earth in earths):
-        log.warning("training without the Earth's light: %s names no Earth that gives some, others do", dark)
+        raise InputError(f"{dataset.root}: {expected}, found none in {dark[0]}")
+    if light.field.surface and light.earth is None:
+        if not dark:
+            light = replace(light, earth=True)
+        elif len(dark) < len(dataset.train):
+            log.warning("training without the Earth's light: %s names no Earth that gives some, others do", dark[0])
     if light.linear:
         tone, exposure = tone_and_exposure(dataset.scene) or ("srgb", 0.0)
         exposure = exposure if light.exposure is None else light.exposure

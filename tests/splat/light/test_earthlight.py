@@ -329,6 +329,7 @@ def test_an_earth_that_gives_no_light_is_not_learned(small_lit_dataset, tmp_path
     dataset, short = replace(small_lit_dataset, train=tuple(dark)), replace(CONFIG, iterations=1)
     run = train(dataset, tmp_path / "run", short)
     assert not run.knows_earth
+    assert "without the Earth's light" not in caplog.text, "none of the others gives some either"
     frame = small_lit_dataset.test[0]
     sun = replace(frame.sun, earth=Earth(frame.sun.direction, albedo=0.0))
     assert run.predict(frame.camera, sun).rgb.max() == 0 < run.predict(frame.camera, frame.sun).rgb.max()
