@@ -17,6 +17,11 @@ class Joined:
         self.size = sum(sizes)
         self._parts = list(zip(accumulate(sizes[:-1], initial=0), sizes, strict=True))
 
+    @property
+    def starts(self) -> list[int]:
+        """Where each array begins."""
+        return [first for first, _ in self._parts]
+
     def load(self, arrays: Sequence[Float], place: UInt32 | None = None, row: UInt32 | int = 0) -> Float:
         """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`."""
         place = self._all() if place is None else place

@@ -5,7 +5,6 @@ are per side of the box, so that a field does not know how large it is.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -29,7 +28,7 @@ class DensityTape:
     """What the adjoint of a density wants."""
 
     point: Array3f  #: [3, N]
-    layers: list[Any]  #: of the network
+    layers: mlp.MlpTape  #: of the network
     log_density: Float  #: [N]
 
 
@@ -51,11 +50,11 @@ class DensityField:
         """`Parameters` to start from."""
         return [self.grid.initial(rng), *mlp.initial_weights(self.shape, rng)]
 
-    def look_up(self, parameters: Parameters, point: Array3f) -> tuple[Float, TensorXf, DensityTape]:
-        """(density [N] per side, outputs [B, 1 + features, 512], tape) at points [3, N] of the box."""
+    def look_up(self, parameters: Parameters, point: Array3f) -> tuple[Float, list[Float], DensityTape]:
+        """(density [N] per side, 1 + features outputs, [N] each, tape) at points [3, N] of the box."""
         items = to_matrix(self.grid.look_up(parameters[0], point))
         output, layers = mlp.forward(self.shape, parameters[1:], items, _one())
-        log_density = row(output, 0)
+        log_density = output[0]
         return dr.exp(dr.minimum(log_density, MAX_LOG_DENSITY)), output, DensityTape(point, layers, log_density)
 
     def adjoint(
@@ -87,7 +86,7 @@ class FieldTape:
     """What the adjoint of a field wants."""
 
     density: DensityTape  #: what the density's own adjoint wants
-    layers: list[Any]  #: of the colour network
+    layers: mlp.MlpTape  #: of the colour network
     color: list[Float]  #: [N] each
     normal: Array3f | None  #: [3, N] of any length, where there are some
     view: Array3f  #: [3, N]
@@ -145,7 +144,7 @@ class RadianceField:
         view, sun: [3, N] unit, from the camera and towards the Sun; None: the field does not take it
         """
         density, output, tape = self.density.look_up(parameters[: self.split], point)
-        features = [row(output, 1 + i) for i in range(output.shape[1] - 1)]
+        features = output[1:]
         normal = None
         if self.has_normals:
             assert sun is not None, "a field that takes the Sun"
@@ -155,7 +154,7 @@ class RadianceField:
             directions = self.directions(view, sun)
         items = to_matrix([*features[: self.features], *directions])
         raw, layers = mlp.forward(self.color, parameters[self.split :], items, _one())
-        color = [sigmoid(row(raw, i)) for i in range(self.color.outputs)]
+        color = [sigmoid(value) for value in raw]
         return density, color, FieldTape(tape, layers, color, normal, view, sun)
 
     def adjoint(
@@ -211,4 +210,4 @@ def _place(column: UInt32, i: int, height: int) -> UInt32:
 
 def _one() -> Float:
     """What all points share: nothing, so the first layer has a second bias."""
-    return dr.opaque(ad.Float, 1, 1)
+    return ad.Float(1)

@@ -109,6 +109,5 @@ def _largest_difference() -> float:
     packed = pack(shape, weights)
     outputs = [run(packed, rows, shared, batch) for _ in range(2)][1]
     exact, _ = mlp.forward(shape, weights, batch.matrix(batch.block(rows, 0, 19), shape.rows), shared)
-    pairs = zip(outputs, (batch.row(exact, i) for i in range(shape.outputs)), strict=True)
-    sigmoids = [[1 / (1 + np.exp(-np.array(row))) for row in pair] for pair in pairs]
+    sigmoids = [[1 / (1 + np.exp(-np.array(row))) for row in pair] for pair in zip(outputs, exact, strict=True)]
     return max(float(np.abs(ours - other).max()) for ours, other in sigmoids)

@@ -6,7 +6,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, TensorXf, UInt32
+from spacesim.backend.arrays import Bool, Float, TensorXf, UInt32
 from spacesim.backend.upload import held
 from spacesim.splat.raster.lists.tiles import round_capacity
 
@@ -27,11 +27,17 @@ class PaddedBatch:
 
     count: UInt32  #: UInt32 of width 1, N
     capacity: int
+    room: UInt32  #: UInt32 of width 1, M where it may be no number of a kernel's text, as each would be compiled
 
     @staticmethod
     def of(count: int, still: bool = False) -> "PaddedBatch":
         """For N = `count` Gaussians, at least one. still: of a model of constant size, with less padding."""
-        return PaddedBatch(held(count, "columns"), (count // CHUNK + 1) * CHUNK if still else round_capacity(count))
+        capacity = (count // CHUNK + 1) * CHUNK if still else round_capacity(count)
+        return PaddedBatch(held(count, "columns"), capacity, held(capacity, "room"))
+
+    def is_real(self) -> Bool:
+        """Bool [M]: whether a column is a Gaussian's."""
+        return self._column() < self.count
 
     def repeat_last(self, values: Any) -> Any:
         """[N] to [M], an array or nested ones; the last is repeated."""

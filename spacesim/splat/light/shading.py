@@ -75,8 +75,8 @@ class ShadingInputs:
 class ShadingTape:
     """What the adjoint needs of the forward pass."""
 
-    field: list[TensorXf]  #: of the appearance field, layer by layer
-    refine: list[TensorXf]  #: of the shadow refinement network, layer by layer, or nothing
+    field: mlp.MlpTape  #: of the appearance field
+    refine: mlp.MlpTape | None  #: of the shadow refinement network, if there is one
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
@@ -93,12 +93,13 @@ def shade(
     views = field_views(config.field, field_inputs, batch)
     items = field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, inputs.sun.field_encoding)
-    colors = [field_color(config.decoding, batch.row(output, i)) for i in range(3)]
+    colors = [field_color(config.decoding, value) for value in output]
     occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
-    outputs = _dimmed(inputs.sun, colors, [1 - value for value in occlusion], faces)
-    dr.eval(outputs, colors, occlusion, faces)
-    emitted = _emitted(config, field_weights, inputs, [1 - value for value in occlusion], batch)
+    visibility = [1 - value for value in occlusion]
+    outputs = _dimmed(inputs.sun, colors, visibility, faces)
+    dr.eval(outputs, colors, occlusion, visibility, faces)
+    emitted = _emitted(config, field_weights, inputs, visibility, batch, field_tape.input_layer)
     light = _received(config, inputs, emitted, batch, sides=True, mirrors=config.mirrors)
     scattered = _scattered(config, inputs, light[:6], light[6:], batch)
     if scattered:
@@ -124,8 +125,7 @@ def shade_picture(
     if packed is None:
         assert first_layer is not None, "one of the two"
         items = batch.matrix(views, round_up_rows(len(views)))
-        output, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
-        outputs = [batch.row(output, i) for i in range(3)]
+        outputs, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
     else:
         rows = batch.block(inputs.features, 0, field.features) + views
         outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
@@ -188,14 +188,14 @@ def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
 
 def _refine_occlusion(
     config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[list[Float], list[TensorXf]]:
+) -> tuple[list[Float], mlp.MlpTape | None]:
     """([refined occlusion [M]] or [], tape of the refinement)."""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
     if not config.refine:
-        return occlusion, []
+        return occlusion, None
     items = _refine_items(config, config.refine, inputs, batch)
-    output, tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
-    return [refine_occlusion(config.refine, occlusion[0], batch.row(output, 0))], tape
+    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
+    return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
 
 @recorded
@@ -223,15 +223,24 @@ def adjoint(
         )
     gradients = [gradient * slope for gradient, slope in zip(gradients, slopes, strict=True)]
     pairs = list(zip(gradients, tape.colors, strict=True))
+    grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_output = batch.matrix([g * visibility * field_color_slope(config.decoding, c) for g, c in pairs])
-    grad_weights, grad_items = mlp.backward(
-        config.field.shape, field_weights, tape.field, inputs.sun.field_encoding, grad_output
-    )
+    encoding = inputs.sun.field_encoding
+    ways = [mlp.WayBack(config.field.shape, field_weights, tape.field, encoding, grad_output)]
+    if config.refine:
+        assert tape.refine is not None, "it was refined"
+        grad_occlusion = -sum(
+            (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
+        )
+        occlusion = tape.occlusion[0]
+        grad_logit = batch.matrix([grad_occlusion * occlusion * (1 - occlusion)])
+        encoding = inputs.sun.refine_encoding
+        ways.append(mlp.WayBack(config.refine.shape, refine_weights, tape.refine, encoding, grad_logit))
+    (grad_weights, grad_items), *of_refinement = mlp.backward_together(ways)
     by_encoding = []
     if config.field.embeddings or by_sun:
         by_encoding = [mlp.shared_gradient(config.field.shape, field_weights, grad_weights)]
     parts = [(grad_items, 0, config.field.features)]
-    grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
     grad_sun = []
     if by_sun:
@@ -239,18 +248,10 @@ def adjoint(
     if config.field.surface:
         field_inputs = _field_inputs(inputs)
         parts.append((normals_adjoint(config.field, field_inputs, grad_items, grad_facing, grad_earth, batch), 0, 3))
-    if config.refine:
-        grad_occlusion = -sum(
-            (g * c for g, c in pairs), sum((_picture_visibility(g, tape.faces) for g in grad_shown), ad.Float(0))
-        )
-        occlusion = tape.occlusion[0]
-        grad_logit = grad_occlusion * occlusion * (1 - occlusion)
-        grad_output = batch.matrix([grad_logit])
-        grad_refine_weights, grad_items = mlp.backward(
-            config.refine.shape, refine_weights, tape.refine, inputs.sun.refine_encoding, grad_output
-        )
-        grad_weights += grad_refine_weights
-        parts.append((grad_items, 1, config.refine.features))  # the raw occlusion stands before them
+    for of_weights, of_items in of_refinement:
+        assert config.refine is not None
+        grad_weights += of_weights
+        parts.append((of_items, 1, config.refine.features))  # the raw occlusion stands before them
     if grad_albedo:
         parts.append((batch.matrix(grad_albedo), 0, len(grad_albedo)))
     by_encoding = by_encoding if config.field.embeddings else []
@@ -300,16 +301,21 @@ def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch
 
 
 def _emitted(
-    config: LightConfig, weights: list[Float], inputs: ShadingInputs, visibility: list[Float], batch: PaddedBatch
+    config: LightConfig,
+    weights: list[Float],
+    inputs: ShadingInputs,
+    visibility: list[Float],
+    batch: PaddedBatch,
+    input_layer: mlp.InputLayer | None = None,
 ) -> list[Float]:
     """What `emission` gives, or nothing. weights: of the field;  visibility: of each Gaussian in a list, or nothing
-    for 1"""
+    for 1;  input_layer: of the field, if it is known"""
     surroundings = inputs.surroundings
     if surroundings is None:
         return []
     scatterers, emitters = _scatterers(config, inputs), surroundings.emitters
     if config.mirrors:
-        light = _painted(config, weights, inputs, visibility, emitters, batch.count)
+        light = _painted(config, weights, inputs, visibility, emitters, batch.count, input_layer)
     else:
         light = albedo_radiance(scatterers, visibility, emitters, batch.count)
     return emission(scatterers, surroundings, config.bounce, light, batch.count)
@@ -338,15 +344,17 @@ def _painted(
     visibility: list[Float],
     emitters: UInt32,
     gaussians: UInt32,
+    input_layer: mlp.InputLayer | None,
 ) -> list[Float]:
     """The light of the Gaussians that are `emitters`, three Floats, as the field paints them: mean of what is seen of
     each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the
     Sun.
 
-    weights: of the field;  visibility: as in `_emitted`
+    weights: of the field;  visibility, input_layer: as in `_emitted`
     """
     field, count = config.field, config.bounce
-    columns = PaddedBatch(gaussians, -(-SIDES * count // CHUNK) * CHUNK)
+    room = -(-SIDES * count // CHUNK) * CHUNK
+    columns = PaddedBatch(gaussians, room, ad.UInt32(room))
     column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
     number, side = dr.gather(ad.UInt32, emitters, column // SIDES), column % SIDES
     normals = lit_normals(_scatterers(config, inputs), number, gaussians)
@@ -355,8 +363,9 @@ def _painted(
     direction = -(0.5**0.5) * (normals + cosine * along + sine * dr.cross(normals, along))
     rows = [dr.gather(ad.Float, inputs.features, i * gaussians + number) for i in range(field.features)]
     rows += [*field.view(direction), *surface_cosines(normals, direction, towards_sun(inputs.sun.light_axes))]
-    output, _ = mlp.forward(field.shape, weights, columns.matrix(rows, field.shape.rows), inputs.sun.field_encoding)
-    colors = [field_color(config.decoding, columns.row(output, i)) for i in range(3)]
+    items = columns.matrix(rows, field.shape.rows)
+    output, _ = mlp.forward(field.shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
+    colors = [field_color(config.decoding, value) for value in output]
     for share in visibility:
         colors = [color * dr.gather(ad.Float, share, number) for color in colors]
     light = colors if config.linear else [decode_srgb(color) for color in colors]

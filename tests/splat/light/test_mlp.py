@@ -24,8 +24,10 @@ def numbers(values) -> np.ndarray:
 
 
 def columns(tensor, count: int) -> np.ndarray:
-    """[C, N] of [B, C, m]."""
+    """[C, N] of [B, C, m], or of rows [B * m]."""
     array = numbers(tensor)
+    if isinstance(tensor, list):
+        return array[:, :count]
     return array.transpose(1, 0, 2).reshape(array.shape[1], -1)[:, :count]
 
 
@@ -93,7 +95,8 @@ def test_networks_and_their_adjoint_match_float64(name, count):
     case = Case(SHAPES[name], count)
     output, gradients, grad_items = passes(case.shape, *case.device())
     exact, exact_gradients, exact_by_items = case.exact()
-    assert output.shape[1:] == (case.shape.outputs, CHUNK)
+    assert len(output) == case.shape.outputs
+    assert dr.width(output) == case.device()[-1].capacity
     np.testing.assert_allclose(columns(output, count), exact, atol=2e-6)
     np.testing.assert_allclose(columns(grad_items, count)[: case.shape.inputs], exact_by_items, atol=5e-6)
     assert len(gradients) == len(case.weights)
@@ -212,3 +215,20 @@ def test_cooperative_vectors_that_fail_or_lie_are_not_used(monkeypatch, caplog):
         assert not cooperative.is_usable()
         assert message in caplog.records[-1].getMessage()
     cooperative.is_usable.cache_clear()
+
+
+@pytest.mark.usefixtures("_ways")
+def test_networks_that_go_back_together_have_the_same_gradients():
+    ways, alone = [], []
+    for name in SHAPES:
+        case = Case(SHAPES[name], CHUNK + 1)
+        weights, rows, shared, grad_rows, batch = case.device()
+        items = batch.matrix([batch.pad_zeros(row) for row in rows], case.shape.rows)
+        _, tape = mlp.forward(case.shape, weights, items, shared)
+        grad_output = batch.matrix([batch.pad_zeros(row) for row in grad_rows])
+        ways.append(mlp.WayBack(case.shape, weights, tape, shared, grad_output))
+        alone.append(mlp.backward(case.shape, weights, tape, shared, grad_output))
+    for one, other in zip(mlp.backward_together(ways), alone, strict=True):
+        np.testing.assert_array_equal(numbers(one[1]), numbers(other[1]))
+        for gradient, same in zip(one[0], other[0], strict=True):
+            np.testing.assert_array_equal(numbers(gradient), numbers(same))

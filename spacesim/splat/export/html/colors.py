@@ -126,7 +126,7 @@ class _Cosines:
         items = batch.matrix(rows, mlp.round_up_rows(len(rows)))
         shared = self.light.encode_sun(None).field_encoding
         output, _ = mlp.forward(field.shape, self.weights, items, shared, self.first_layer)
-        colors = [field_color(self.light.config.decoding, batch.row(output, channel)) for channel in range(3)]
+        colors = [field_color(self.light.config.decoding, value) for value in output]
         dr.eval(colors)
         return np.stack([np.array(color)[: self.gaussians.count] for color in colors], axis=1)
 

@@ -12,6 +12,7 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32, UInt64
 from spacesim.backend.upload import held, held_float
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import check_fields
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.bias import Bias, grazing_bias, offset_receivers, receiver_bias
 from spacesim.splat.light.shadow.clusters import occlusion_in_clusters
 from spacesim.splat.light.shadow.light_camera import fit_camera
@@ -37,7 +38,6 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import make_boxes, make_lists
 from spacesim.splat.raster.lists.boxes import Boxes, Grid
 from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent, PairCounts
-from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import Footprints, Splats
 
 MAX_LIGHT_SIZE = 8192  #: pixels of a side of the light's picture
@@ -118,14 +118,13 @@ def cast_shadows(
         light,
         *_numbers(config),
         softness,
-        held(gaussians.count, "Gaussians"),
+        PaddedBatch.of(gaussians.count),
         config.method,
         config.size,
         config.crop,
         config.grazing,
-        round_capacity(gaussians.count),
     )
-    splats = gaussians.count if isinstance(config.method, MappingConfig) else 2 * sunlit.capacity
+    splats = gaussians.count if isinstance(config.method, MappingConfig) else 2 * sunlit.batch.capacity
     extent = Extent(splats, config.size, config.size)
     expected = pairs.expected(extent)
     if expected is not None:
@@ -202,12 +201,11 @@ class _Sunlit:
     strength: Float  #: of the bias
     reach: Float  #: of the grazing bias
     softness: Float  #: metres
-    count: UInt32  #: N
+    batch: PaddedBatch  #: of N
     method: MappingConfig | SplattingConfig
     size: int  #: of the light's picture
     crop: bool
     grazing: str
-    capacity: int  #: `round_capacity` of N
 
 
 @dataclass
@@ -233,7 +231,7 @@ class _SunPicture:
 def _seen_by_sun(sunlit: _Sunlit, live: UInt32, most: int, grid: Grid) -> _SunPicture:
     """live: how many splats there are, `most` at most"""
     rows, method = sunlit.rows, sunlit.method
-    camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.capacity)
+    camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.batch)
     view = _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
     if isinstance(method, MappingConfig):
         splats, footprints = project_casters(rows, camera, method.antialiased)
@@ -241,7 +239,7 @@ def _seen_by_sun(sunlit: _Sunlit, live: UInt32, most: int, grid: Grid) -> _SunPi
     else:
         dr.eval(view)
         receivers = Receivers(view.bias.bias, view.points, method.beta_min)
-        splats, footprints = make_events(rows, receivers, camera, False, sunlit.count, sunlit.capacity)
+        splats, footprints = make_events(rows, receivers, camera, False, sunlit.batch)
         dr.schedule(splats, footprints)
     return _SunPicture(view, splats, footprints, make_boxes(splats, footprints, live, most, grid))
 
@@ -254,10 +252,7 @@ def _cast(sunlit: _Sunlit, seen: _SunPicture, limit: UInt32, capacities: Capacit
     if isinstance(method, MappingConfig):
         receivers = MapReceivers(rows, view.points, view.bias.bias, sunlit.softness)
         return occlusion_in_map(receivers, [], seen.splats, lists, view.camera, method, capacities.splats)
-    occlusion = occlusion_in_events(seen.splats, lists, (sunlit.size, sunlit.size), sunlit.capacity)
-    dr.eval(occlusion)
-    index = dr.arange(ad.UInt32, dr.width(rows[0]))
-    return dr.select(index < sunlit.count, dr.gather(ad.Float, occlusion, index), rows[0])
+    return occlusion_in_events(seen.splats, lists, (sunlit.size, sunlit.size), sunlit.batch, rows[0])
 
 
 @recorded

@@ -18,6 +18,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import Array
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import (
     MARGIN,
     MIN_EXTENT_SHARE,
@@ -29,7 +30,6 @@ from spacesim.splat.light.shadow.light_camera import (
 )
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
-from spacesim.splat.raster.lists.tiles import round_capacity
 
 MEANINGFUL_GAP = 0.05  #: of a cluster's extent: a narrower gap between supports is no place to split at
 MAX_CAMERAS = 8  #: K of algorithm 3: the thesis does not say
@@ -66,7 +66,7 @@ def occlusion_in_clusters(
     _check(size, least_scale, most)
     if gaussians.count == 0:
         return dr.zeros(ad.Float, 0)
-    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop, round_capacity(gaussians.count))
+    camera, coverage = _fitted(_shapes(gaussians), light_rows(direction), size, crop, PaddedBatch.of(gaussians.count))
     occlusion: Any = occlude(gaussians, camera)
     if _is_one_camera_enough(coverage, least_scale):
         return occlusion
@@ -215,11 +215,11 @@ def _is_one_camera_enough(coverage: Float, least_scale: float) -> bool:
 
 
 @recorded
-def _fitted(shapes: Shapes, light: Float, size: int, crop: bool, capacity: int) -> tuple[Orthographic, Float]:
+def _fitted(shapes: Shapes, light: Float, size: int, crop: bool, batch: PaddedBatch) -> tuple[Orthographic, Float]:
     """(the one camera of a compact set, Float [4]: its pixels a metre in x and y, how many Gaussians have their centre
     in its image, how many can be drawn). Counts are exact to 2^24."""
     means, log_scales, quaternions, logits = shapes
-    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size, crop, capacity)
+    camera = fit_camera(Gaussians(means, log_scales, quaternions, logits, ad.ArrayXf([])), light, size, crop, batch)
     drawn = drawable_mask(*shapes)
     screen = camera.screen(camera.transform(dr.select(drawn, means, ad.Array3f(0))))
     inside = drawn & (screen.x >= 0) & (screen.x <= size) & (screen.y >= 0) & (screen.y <= size)

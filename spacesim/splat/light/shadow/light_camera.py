@@ -14,9 +14,9 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
-from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.project import ALPHA_MIN
 
 SUPPORT = 3.0  #: standard deviations of a single Gaussian that its light camera holds (thesis 4.31)
@@ -62,7 +62,7 @@ def towards_sun(light: Float) -> Array3f:
 
 
 def fit_camera(
-    gaussians: Gaussians, light: Float, size: int, crop: bool = True, capacity: int | None = None
+    gaussians: Gaussians, light: Float, size: int, crop: bool = True, batch: PaddedBatch | None = None
 ) -> Orthographic:
     """The light camera of size x size pixels that holds the Gaussians' 3 sigma supports (thesis 4.29 to 4.35).
 
@@ -71,18 +71,18 @@ def fit_camera(
     themselves) to either side of the mean, so that a stray Gaussian does not cost the others their resolution; depth
     counts from the plane through that mean. Only Gaussians that can be drawn count; of none, the image is a metre wide
     about the world's origin. Nothing waits for the device. Detached.
-    capacity: `round_capacity` of their number, which a recording that this is a part of must have as an argument
+    batch: of these, which a recording that this is a part of must have as an argument
     """
     if gaussians.count == 0:
         return _camera(light, ad.Array3f(0), [(ad.Float(-0.5), ad.Float(0.5))] * 2, size)
-    assert capacity is not None or not dr.flag(dr.JitFlag.FreezingScope), "a recording is of one capacity"
-    capacity = round_capacity(gaussians.count) if capacity is None else capacity
-    means, log_scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
-    quaternions, logits = dr.detach(gaussians.quaternions), dr.detach(gaussians.logit_opacities)
-    drawn = drawable_mask(means, log_scales, quaternions, logits)
+    assert batch is not None or not dr.flag(dr.JitFlag.FreezingScope), "a recording is of one capacity"
+    batch = PaddedBatch.of(gaussians.count) if batch is None else batch
+    shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities
+    means, log_scales, quaternions, logits = (batch.repeat_last(dr.detach(values)) for values in shapes)
+    drawn = drawable_mask(means, log_scales, quaternions, logits) & batch.is_real()
     means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
     counted = dr.select(drawn, ad.Float(1), 0)
-    [(total, *sums)] = _reduced(capacity, (dr.ReduceOp.Add, 0, [counted, *means]))
+    [(total, *sums)] = _reduced(batch, (dr.ReduceOp.Add, [counted, *means]))
     share = dr.rcp(dr.maximum(total, 1))
     middle = ad.Array3f([axis_sum * share for axis_sum in sums])
     offset, columns, scales = means - middle, principal_axes(quaternions), dr.exp(log_scales)
@@ -94,9 +94,7 @@ def fit_camera(
         support = SUPPORT * dr.sqrt(spread2)  # 4.31
         ends += [dr.select(drawn, end, MAX_MAGNITUDE) for end in (across - support, -across - support)]
         squares.append(counted * dr.fma(across, across, spread2))
-    lowest_ends, spreads = _reduced(
-        capacity, (dr.ReduceOp.Min, MAX_MAGNITUDE, ends), (dr.ReduceOp.Add, 0, squares)
-    )  # 4.32
+    lowest_ends, spreads = _reduced(batch, (dr.ReduceOp.Min, ends), (dr.ReduceOp.Add, squares))  # 4.32
     bounds = []
     for i, square in enumerate(spreads):
         lowest, highest = lowest_ends[2 * i], -lowest_ends[2 * i + 1]
@@ -108,20 +106,19 @@ def fit_camera(
     return _camera(light, middle, bounds, size)
 
 
-def _reduced(capacity: int, *parts: tuple[dr.ReduceOp, float, list[Float]]) -> list[list[Float]]:
-    """Of each part (operation, its identity, rows [N]) its reduced rows, Floats of width 1. Rows lie one after another
-    in blocks of `capacity` numbers: a reduction is two launches, however many rows there are."""
-    blocks, stride = [], dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text
-    for _, identity, rows in parts:
-        numbers = dr.full(ad.Float, identity, len(rows) * capacity)
-        index = dr.arange(ad.UInt32, dr.width(rows[0]))
+def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float]]) -> list[list[Float]]:
+    """Of each part (operation, rows [M]) its reduced rows, Floats of width 1. Rows lie one after another: a reduction
+    is two launches, however many rows there are."""
+    blocks, column = [], dr.arange(ad.UInt32, batch.capacity)
+    for _, rows in parts:
+        numbers = dr.empty(ad.Float, len(rows) * batch.capacity)
         for i, row in enumerate(rows):
-            dr.scatter(numbers, row, index + i * stride, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(numbers, row, column + i * batch.room, mode=dr.ReduceMode.NoConflicts)
         blocks.append(numbers)
     reduced = []
-    for (op, _, rows), numbers in zip(parts, blocks, strict=True):
+    for (op, rows), numbers in zip(parts, blocks, strict=True):
         of_blocks = dr.block_reduce(op, numbers, BLOCK)
-        of_rows = dr.block_reduce(op, of_blocks, capacity // BLOCK)
+        of_rows = dr.block_reduce(op, of_blocks, batch.capacity // BLOCK)
         reduced.append([dr.gather(ad.Float, of_rows, ad.UInt32(i)) for i in range(len(rows))])
     return reduced
 

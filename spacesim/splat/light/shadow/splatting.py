@@ -12,11 +12,12 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Array2f, Array3f, Bool, Float, UInt32
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.adjoint import reduce_mode
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import bin_splats
-from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets, thread_pixels
+from spacesim.splat.raster.lists.tiles import TileLists, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats, _sortable, project
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
@@ -67,14 +68,12 @@ def occlusion_by_splatting(
         bias = bias + dr.zeros(ad.Float, count)
         dr.make_opaque(bias)
     receivers = Receivers(bias, points, beta_min, receives)
-    live, capacity = dr.opaque(ad.UInt32, count), round_capacity(count)
-    rows = [dr.detach(row) for row in gaussians.shape_rows()]
-    events, boxes = make_events(rows, receivers, camera, antialiased, live, capacity)
+    batch, rows = PaddedBatch.of(count), [dr.detach(row) for row in gaussians.shape_rows()]
+    events, boxes = make_events(rows, receivers, camera, antialiased, batch)
     lists = bin_splats(events, boxes, camera.width, camera.height)
     if lists.capacity == 0:
         return dr.opaque(ad.Float, 0, count)
-    occlusion = occlusion_in_events(events, lists, (camera.width, camera.height), capacity)
-    return dr.gather(ad.Float, occlusion, dr.arange(ad.UInt32, count))
+    return occlusion_in_events(events, lists, (camera.width, camera.height), batch, rows[0])
 
 
 @dataclass
@@ -89,18 +88,17 @@ class Receivers:
 
 @recorded
 def make_events(
-    rows: list[Float], receivers: Receivers, camera: Orthographic, antialiased: bool, count: UInt32, capacity: int
+    rows: list[Float], receivers: Receivers, camera: Orthographic, antialiased: bool, batch: PaddedBatch
 ) -> tuple[Splats, Footprints]:
-    """Events [2 capacity] of `count` Gaussians with these `Gaussians.shape_rows`: receivers, then blockers; the rest
-    are invisible.
+    """Events [2 M] of N Gaussians with these `Gaussians.shape_rows`: receivers, then blockers; the rest are invisible.
 
     Receivers come first, so that stable sorting puts them before blockers of the same key: nothing blocks itself, or
-    what is equally deep. antialiased: see `occlusion_by_splatting`;  capacity: `round_capacity` of `count`
+    what is equally deep. antialiased: see `occlusion_by_splatting`
     """
-    event, half = dr.arange(ad.UInt32, 2 * capacity), dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text
-    is_receiver = event < half
-    index = dr.select(is_receiver, event, event - half)
-    live = index < count
+    event = dr.arange(ad.UInt32, 2 * batch.capacity)
+    is_receiver = event < batch.room
+    index = dr.select(is_receiver, event, event - batch.room)
+    live = index < batch.count
     receiving = live & is_receiver
     x, y, z, *shape, logit = (dr.gather(ad.Float, row, index, live) for row in rows)
     means = ad.Array3f(x, y, z)
@@ -128,12 +126,14 @@ def _depth(means: Array3f, camera: Orthographic) -> Float:
 
 
 @recorded
-def occlusion_in_events(events: Splats, lists: TileLists, image_size: tuple[int, int], capacity: int) -> Float:
-    """[capacity]: what each receiver of `make_events` has lost. One thread holds a block of a tile's pixels."""
+def occlusion_in_events(
+    events: Splats, lists: TileLists, image_size: tuple[int, int], batch: PaddedBatch, like: Float
+) -> Float:
+    """[N]: what each receiver of `make_events` has lost. One thread holds a block of a tile's pixels. like: any array
+    [N]"""
     shape, pixels, turn = lists.shape, lists.shape.pixels, TURN[select()]
     branches = select() == "cuda"  # where a warp holds one tile, which meets receivers and blockers as one
-    records = list_records(pack_records(events, [], 2 * capacity), lists, 2 * capacity)
-    receivers = dr.opaque(ad.UInt32, capacity)  # no number of a kernel's text, as in `make_events`
+    records = list_records(pack_records(events, [], 2 * batch.capacity), lists, 2 * batch.capacity)
     thread, (width, height) = thread_pixels(lists), image_size
     inside = [(thread.column + i < width) & (thread.row + j < height) for i, j in thread_offsets(shape)]
     slots = dr.zeros(ad.Float, 2 * lists.capacity)
@@ -168,7 +168,7 @@ def occlusion_in_events(events: Splats, lists: TileLists, image_size: tuple[int,
         numbers = [dr.gather(ad.UInt32, lists.splat, k + u, listed[u]) for u in range(turn)]
         loaded = [records.load(lists, k + u, listed[u]) for u in range(turn)]
         for u, record in enumerate(loaded):
-            powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < receivers
+            powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < batch.room
             if branches:
                 state = k + u, powers, transmittance, listed[u]
                 transmittance = dr.if_stmt(state, receiver, note, block, mode="symbolic")
@@ -180,14 +180,15 @@ def occlusion_in_events(events: Splats, lists: TileLists, image_size: tuple[int,
     state = dr.gather(ad.UInt32, lists.start, thread.tile), [ad.Float(1) for _ in range(pixels)]
     dr.while_loop(state, remaining, take, mode="symbolic", label="shadow")
     dr.eval(slots)
-    lost, weight = _sum_slots(slots, lists, capacity)
+    index = dr.arange(ad.UInt32, dr.width(like))
+    lost, weight = _sum_slots(slots, lists, index)
     seen = weight > 0
-    return dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
+    occlusion = dr.select(seen, dr.clip(lost / dr.select(seen, weight, 1), 0, 1), 0)
+    return dr.select(index < batch.count, occlusion, like)  # as wide as that in each replay, see `PaddedBatch`
 
 
-def _sum_slots(slots: Float, lists: TileLists, capacity: int) -> Array2f:
-    """Array2f [capacity]: the sums over each receiver's slots, in order."""
-    index = dr.arange(ad.UInt32, capacity)
+def _sum_slots(slots: Float, lists: TileLists, index: UInt32) -> Array2f:
+    """Array2f [N]: the sums over the slots of each receiver of number `index`, in order."""
     position = dr.gather(ad.UInt32, lists.first_slot, index)
     end = position + dr.gather(ad.UInt32, lists.slot_count, index)
 

@@ -27,6 +27,7 @@ COMPARED = 4  #: entries compared in a turn of the loop
 #: three quarters of the time
 CLASSES = 64
 CLASSES_AN_OCTAVE = 6  #: so all lists of 1,500 entries and more are of one class
+PACKET = 4  #: numbers that are read at once
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond the longest run: as many as fill a large device
 
 
@@ -58,6 +59,7 @@ class ListBounds:
     cursor: UInt32  #: the starts once more, of what fits: an increment takes a list's next place
     #: all lists by classes of length, the longest first, those of a class in any order
     order: UInt32
+    counts: UInt32  #: lists of each class, then zeros that `ordered_entries` may change: a fill less
 
     def fit(self, limit: UInt32) -> Bool:
         """Whether all entries are within a limit, of width 1."""
@@ -73,13 +75,13 @@ def list_bounds(lengths: UInt32, number: type[UInt32] | type[UInt64], limit: UIn
     fit = _fit(sums, limit)
     end = ad.UInt32(dr.select(fit, sums, 0))
     start = dr.select(fit, end - lengths, 0)
-    counts, class_ = dr.zeros(ad.UInt32, CLASSES), _class_of(lengths)
+    counts, class_ = dr.zeros(ad.UInt32, CLASSES + PACKET), _class_of(lengths)
     rank = cast(UInt32, dr.scatter_inc(counts, class_))
     dr.eval(start, end, rank, class_, counts)
     order, cursor = dr.empty(ad.UInt32, dr.width(lengths)), end - lengths  # no copy of `start`: that is a launch
     dr.scatter(order, index, _count_longer(counts, class_) + rank)
     dr.eval(order, cursor)
-    return ListBounds(sums, start, end, cursor, order)
+    return ListBounds(sums, start, end, cursor, order, counts)
 
 
 def _fit(sums: UInt32 | UInt64, limit: UInt32) -> Bool:
@@ -135,9 +137,9 @@ def ordered_entries(
     targets = [dr.empty(ad.UInt32, capacity) for _ in range(parts)]
     for value, target in zip(own, targets, strict=False):
         dr.scatter(target, dr.select(live, ad.UInt32(value), 0), place)
-    some_long = dr.zeros(ad.UInt32, 1)
-    dr.scatter(some_long, ad.UInt32(1), ad.UInt32(0), is_long)
-    dr.eval(targets, in_runs, some_long)
+    dr.scatter(bounds.counts, ad.UInt32(1), ad.UInt32(CLASSES), is_long)
+    dr.eval(targets, in_runs, bounds.counts)
+    some_long = dr.gather(ad.UInt32, bounds.counts, ad.UInt32(CLASSES))
     _merge_runs(targets, in_runs, some_long, start, end, sizes[-1])
     return targets
 
@@ -150,9 +152,9 @@ def _class_of(lengths: UInt32) -> UInt32:
 def _count_longer(counts: UInt32, class_: UInt32) -> UInt32:
     """How many lists are of longer classes, [N]. counts: lists of each class"""
     longer = ad.UInt32(0)
-    for four in range(CLASSES // 4):
+    for four in range(CLASSES // PACKET):
         for i, count in enumerate(dr.gather(ad.Array4u, counts, ad.UInt32(four))):
-            longer += dr.select(4 * four + i > class_, count, 0)
+            longer += dr.select(PACKET * four + i > class_, count, 0)
     return longer
 
 

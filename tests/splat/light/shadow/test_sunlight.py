@@ -8,6 +8,7 @@ from splats import random_splats
 from spacesim.backend import recorded, recordings
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import direction_from_angles, fibonacci_sphere
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import MARGIN, REACH, fit_camera, light_axes, light_rows, towards_sun
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.reference.shadow_mapping import camera_record, reference_bounds
@@ -103,18 +104,20 @@ def test_degenerate_sets_have_sensible_cameras():
 
 
 def test_another_sun_replays_the_recording():
-    def fit(rows, light):
-        return fit_camera(Gaussians.from_rows(rows), light, 32, capacity=1024)
+    def fit(rows, light, batch):
+        return fit_camera(Gaussians.from_rows(rows), light, 32, batch=batch)
 
     gaussians = Gaussians.from_numpy(random_splats(64))
     replay, before = recorded(fit, limit=8), recordings()
     for sun in ([0, 0, 1], [1, 0, 0], [-1, -1, 0.2]):
-        again, alone = replay(gaussians.rows(), light_rows(sun)), fit_camera(gaussians, light_rows(sun), 32)
+        again = replay(gaussians.rows(), light_rows(sun), PaddedBatch.of(64))
+        alone = fit_camera(gaussians, light_rows(sun), 32)
         assert np.array_equal(np.array(again.values), np.array(alone.values))
         assert (again.width, again.height) == (32, 32)
     for count in (100, 1023):  # of the same capacity
         others = Gaussians.from_numpy(random_splats(count))
-        again, alone = replay(others.rows(), light_rows([0, 1, 1])), fit_camera(others, light_rows([0, 1, 1]), 32)
+        again = replay(others.rows(), light_rows([0, 1, 1]), PaddedBatch.of(count))
+        alone = fit_camera(others, light_rows([0, 1, 1]), 32)
         assert np.array_equal(np.array(again.values), np.array(alone.values))
     assert recordings() == before + 1
 
