@@ -2,11 +2,12 @@
 
 A part (`adam.parts`) is a few rows and a recorded function. The rows and moments that it replaces go at once: a
 step holds all of them once, and only those of a part twice (docs/research/memory.md). Many rows in one kernel were also
-slower on a CPU.
+slower on a CPU. Where kernels take less time than to ask for a function, all parts are one.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import drjit as dr
 
@@ -23,6 +24,7 @@ from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
 from spacesim.splat.train.stages import mean, shape_values
 
+FEW = {"cuda": 2**17, "llvm": 0}  #: Gaussians, at most, all of whose parts are one recorded function
 Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
 
 
@@ -38,6 +40,21 @@ class ViewGradients:
     grad_rows: list[Float] = field(default_factory=list)  #: of the first rows, beside what the splats give them
 
 
+@dataclass
+class _Taught:
+    """What moves rows, as kernels read it."""
+
+    #: of each view its camera, and gradients by its splats, by what was blended, and of the first rows
+    views: list[tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]]
+    degree: int  #: of the harmonics that were drawn
+    factors: Float  #: [2 + R], Adam's two corrections and the step size of each row
+    penalties: Mapping[str, Float]  #: weights by name
+    largest: list[Float]  #: ln of metres, of width 1, or nothing
+    antialiased: bool
+    scale: float
+    surfels: bool
+
+
 class Update:
     """Moves all parameters by the mean gradient of some views.
 
@@ -49,7 +66,7 @@ class Update:
     def __init__(self, antialiased: bool, scale: float, surfels: bool = False) -> None:
         self.antialiased, self.scale, self.surfels = antialiased, scale, surfels
         self._own, self._features = recorded(_move_own), recorded(_move_features)
-        self._harmonics = recorded(_move_harmonics)
+        self._harmonics, self._all = recorded(_move_harmonics), recorded(_move_all)
 
     def __call__(
         self,
@@ -71,42 +88,50 @@ class Update:
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
-        means, packed = rows[:3], (optimizer.arrays[0], optimizer.layouts[0])
-        cameras = [view.camera for view in views]
+        of_views = [(view.camera, view.grad_splats, view.grad_values, view.grad_rows) for view in views]
+        fixed = self.antialiased, self.scale, self.surfels
+        taught = _Taught(of_views, degree, factors, penalties, list(largest), *fixed)
         grad_features = [view.grad_features for view in views if view.grad_features is not None]
-        of_own = [_without_features(view) for view in views]
         views.clear()
-        grad_sums, *moved = self._own(
-            rows,
-            optimizer.slices[0].stop,
-            packed,
-            of_own,
-            degree,
-            factors,
-            penalties,
-            list(largest),
-            self.antialiased,
-            self.scale,
-            self.surfels,
-        )
-        del packed, of_own
-        _replace(gaussians, optimizer, rows, 0, *moved)
-        if gaussians.features is not None:
-            rows[-1], optimizer.features = self._features(rows[-1], optimizer.features, grad_features, factors)
+        stops = [part.stop for part in optimizer.slices if part.start < OWN + 3 * (degree + 1) ** 2]
+        if gaussians.count <= FEW[select()]:
+            packed = list(zip(optimizer.arrays, optimizer.layouts, strict=True))[: len(stops)]
+            of_features = [optimizer.features, grad_features] if grad_features else []
+            parts, moved_features = self._all(rows, stops, packed, of_features, taught)
+            for number, step in enumerate(parts):
+                _replace(gaussians, optimizer, rows, number, *step)
+        else:
+            moved_features = self._part_by_part(gaussians, optimizer, rows, stops, grad_features, taught)
+        if moved_features:
+            rows[-1], *optimizer.features = moved_features
             gaussians.replace(rows)
-            return
-        for number, part in enumerate(optimizer.slices[1:], 1):
-            first = (part.start - OWN) // 3
-            if first >= (degree + 1) ** 2:
-                break
+
+    def _part_by_part(
+        self,
+        gaussians: Gaussians,
+        optimizer: Adam,
+        rows: list[Float],
+        stops: list[int],
+        grad_features: list[Float],
+        taught: "_Taught",
+    ) -> list[Float]:
+        """See `_move_all`: replaces all but the features, which are returned."""
+        means, cameras, factors = rows[:3], [camera for camera, *_ in taught.views], taught.factors
+        packed = optimizer.arrays[0], optimizer.layouts[0]
+        grad_sums, *own = self._own(rows, stops[0], packed, taught)
+        del packed
+        taught.views.clear()
+        _replace(gaussians, optimizer, rows, 0, *own)
+        del own
+        if grad_features:
+            return self._features(rows[-1], optimizer.features, grad_features, factors)
+        for number, (start, stop) in enumerate(pairwise(stops), 1):
             packed = optimizer.arrays[number], optimizer.layouts[number]
-            step = self._harmonics(rows[part], packed, first, degree, means, cameras, grad_sums, factors)
+            first = (start - OWN) // 3
+            step = self._harmonics(rows[start:stop], packed, first, taught.degree, means, cameras, grad_sums, factors)
             del packed
             _replace(gaussians, optimizer, rows, number, *step)
-
-
-def _without_features(view: ViewGradients) -> tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]:
-    return view.camera, view.grad_splats, view.grad_values, view.grad_rows
+        return []
 
 
 def _replace(
@@ -120,35 +145,43 @@ def _replace(
         gaussians.sh = ad.ArrayXf(rows[ROWS["sh"]])
 
 
+def _move_all(
+    rows: list[Float], stops: list[int], packed: list[Packed], of_features: list[list[Float]], taught: _Taught
+) -> tuple[list[tuple[list[Float], list[Float]]], list[Float]]:
+    """(rows and moments of each part, those of the features or nothing). stops: where parts end;  of_features: moments
+    and gradients of the features, or nothing"""
+    grad_sums, *own = _move_own(rows, stops[0], packed[0], taught)
+    steps = [(own[0], own[1])]
+    if of_features:
+        moments, gradients = of_features
+        return steps, _move_features(rows[-1], moments, gradients, taught.factors)
+    cameras = [camera for camera, *_ in taught.views]
+    for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
+        shared = taught.degree, rows[:3], cameras, grad_sums, taught.factors
+        steps.append(_move_harmonics(rows[start:stop], of_part, (start - OWN) // 3, *shared))
+    return steps, []
+
+
 def _move_own(
-    rows: list[Float],
-    count: int,
-    packed: Packed,
-    views: list[tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]],
-    degree: int,
-    factors: Float,
-    penalties: Mapping[str, Float],
-    largest: list[Float],
-    antialiased: bool,
-    scale: float,
-    surfels: bool,
+    rows: list[Float], count: int, packed: Packed, taught: _Taught
 ) -> tuple[list[list[Float]], list[Float], list[Float]]:
     """A step of the first `count` rows. rows: all of them.
 
     Also, of each view, the gradients of the sums of harmonics: 3 Floats [N], none where colours come from a field.
     """
+    views, degree = taught.views, taught.degree
     shape_rows = [ad.Float(row) for row in rows[:OWN]]
     dr.enable_grad(shape_rows)
     gaussians = Gaussians.from_rows([*shape_rows, *rows[OWN:]])
     along = ad.Float(0)
     grad_sums: list[list[Float]] = []
     for camera, grad_splats, grad_values, grad_rows in views:
-        splats, _ = project(gaussians, camera, antialiased)
+        splats, _ = project(gaussians, camera, taught.antialiased)
         for name in ("opacity", "x", "y", "a", "b", "c"):
             along += getattr(splats, name) * getattr(grad_splats, name)
         for row, gradient in zip(shape_rows, grad_rows, strict=False):
             along += row * gradient
-        for name, group in shape_values(gaussians, splats, camera, grad_values, scale).items():
+        for name, group in shape_values(gaussians, splats, camera, grad_values, taught.scale).items():
             for value, gradient in zip(group, grad_values[name], strict=True):
                 along += value * gradient
         grad_sums.append([])
@@ -157,15 +190,15 @@ def _move_own(
             for total, gradient in zip(sums, grad_values["color"], strict=True):
                 grad_sums[-1].append(dr.select(is_unclamped(total), gradient, 0))
                 along += total * grad_sums[-1][-1]
-    for name, weight in penalties.items():
+    for name, weight in taught.penalties.items():
         along += len(views) * weight * penalty(name, gaussians)
     dr.backward(along if len(views) == 1 else along / len(views))
     grad_rows = [dr.grad(row) for row in shape_rows]
     grad_rows += [mean([SH_C0 * grad_sum[c] for grad_sum in grad_sums]) for c in range(count - OWN)]
-    moved, moments = _step([*dr.detach(shape_rows), *rows[OWN:count]], grad_rows, packed, factors, 0)
-    for bound in largest:
+    moved, moments = _step([*dr.detach(shape_rows), *rows[OWN:count]], grad_rows, packed, taught.factors, 0)
+    for bound in taught.largest:
         moved[ROWS["log_scales"]] = [dr.minimum(row, bound) for row in moved[ROWS["log_scales"]]]
-    if surfels:
+    if taught.surfels:
         moved[ROWS["log_scales"]] = flattened(moved[ROWS["log_scales"]])
     dr.eval(grad_sums, moved, moments)
     return grad_sums, moved, moments
@@ -193,14 +226,13 @@ def _move_harmonics(
     return moved, moments
 
 
-def _move_features(
-    row: Float, moments: list[Float], grad_features: list[Float], factors: Float
-) -> tuple[Float, list[Float]]:
-    """A step of the features, one packed row."""
+def _move_features(row: Float, moments: list[Float], grad_features: list[Float], factors: Float) -> list[Float]:
+    """A step of the features, one packed row: that and its moments."""
     first, second = moments
     corrections, rates = _numbers(factors, OWN, 1)
     moved, [first], [second] = adam_step([row], [mean(grad_features)], ([first], [second]), rates, corrections)
-    return moved[0], [first, second]
+    dr.eval(moved, first, second)
+    return [moved[0], first, second]
 
 
 def _step(
