@@ -10,6 +10,7 @@ from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
 from spacesim.learning.joined import Joined
+from spacesim.splat.raster.blend import forward
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import make_boxes, make_lists
@@ -17,6 +18,7 @@ from spacesim.splat.raster.lists.boxes import Boxes, Grid
 from spacesim.splat.raster.lists.capacity import Capacities
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats, project
+from spacesim.splat.raster.records import BlendResult
 from spacesim.splat.raster.render import view_colors
 from spacesim.splat.raster.supersample import pixel_means
 from spacesim.splat.raster.surface import normals
@@ -89,6 +91,26 @@ def list_view(
     assert drawn.boxes.pair_ends is not None
     lists = make_lists(drawn.footprints, drawn.boxes, limit, capacities, grid)
     return drawn.splats, drawn.values, drawn.radii, lists, drawn.boxes.pair_ends
+
+
+@dataclass
+class DrawnView:
+    """A view that was listed and blended at once, without light."""
+
+    splats: Splats  #: on the screen
+    radii: Float | None  #: of `screen_radii`
+    lists: TileLists
+    pair_ends: UInt32 | UInt64  #: of the boxes
+    channels: dict[str, int]  #: how many planes each name has
+    blended: BlendResult  #: what `forward` leaves behind
+
+
+def draw_view(view: ViewRequest, limit: UInt32, capacities: Capacities, grid: Grid) -> DrawnView:
+    """`list_view`, and what it lists blended."""
+    splats, values, radii, lists, pair_ends = list_view(view, limit, capacities, grid)
+    planes = [value for group in values.values() for value in group]
+    blended = forward(splats, planes, lists, view.camera.width, view.camera.height, adjoint=True)
+    return DrawnView(splats, radii, lists, pair_ends, {name: len(group) for name, group in values.items()}, blended)
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:

@@ -1,11 +1,14 @@
 """One view of a training step: forward from Gaussians to a picture, its loss, and backward to gradients of Gaussians.
 
 All is recorded and replayed without tracing, lists and what reads them once for each capacity. Where the number of
-pairs is expected, a view is projected and listed in one recording; where it is not, the host waits between two.
+pairs is expected, a view is projected and listed in one recording, and blended in it where that needs no light; where
+it is not, the host waits between two.
 """
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+
+import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float
@@ -30,6 +33,7 @@ from spacesim.splat.train.stages import (
     TargetImage,
     ViewRequest,
     ViewSplats,
+    draw_view,
     find_view_boxes,
     list_view,
     picture_loss,
@@ -118,6 +122,7 @@ class ViewPass:
         factors = [2**power for power in range(config.num_downscales + 1)]
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
+        self._draw = recorded(draw_view, elements=_elements)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
@@ -147,8 +152,13 @@ class ViewPass:
             drawn = self._find_boxes(asked, extent.most, grid)
             splats, values, radii = drawn.splats, drawn.values, drawn.radii
         else:
-            limit, capacities = held(expected, "pairs"), extent.capacities(expected)
-            splats, values, radii, lists, pair_ends = self._list(asked, limit, capacities, grid)
+            listing = held(expected, "pairs"), extent.capacities(expected), grid
+            if light is None:
+                view_drawn = self._draw(asked, *listing)
+                pairs.check(extent, view_drawn.pair_ends, expected)
+                tape = BlendTape(view_drawn.splats, view_drawn.lists, view_drawn.blended)
+                return RenderedView(camera, downscale, view_drawn.radii, view_drawn.channels, None, tape)
+            splats, values, radii, lists, pair_ends = self._list(asked, *listing)
             pairs.check(extent, pair_ends, expected)
         of_sun = self.pairs.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
@@ -221,6 +231,11 @@ class ViewPass:
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
+
+
+def _elements(arrays: list[Float], view: ViewRequest, *_: object) -> int:
+    """The fewer of Gaussians and pixels."""
+    return min(dr.width(arrays[0]), view.camera.width * view.camera.height)
 
 
 def _camera_numbers(supersample: int, camera: Camera, downscale: int) -> tuple[list[float], int, int]:
