@@ -374,7 +374,7 @@ from dataclasses import dataclass
 import drjit as dr
 from spacesim import backend
 from spacesim.backend.arrays import Float
-from spacesim.learning.mlp import MlpShape
+from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.light import cooperative
 
 faulthandler.dump_traceback_later(60, exit=True)

@@ -5,7 +5,7 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
-from spacesim.learning.joined import Joined
+from spacesim.learning.networks.joined import Joined
 
 SIZES = (3, 1, 40, 7)
 

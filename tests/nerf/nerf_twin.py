@@ -85,7 +85,7 @@ def merge(
 
 
 def network(shape: object, weights: list[np.ndarray], items: np.ndarray) -> np.ndarray:
-    """[N, outputs] of inputs [N, inputs], with ReLU between layers. weights: as `mlp.initial_weights` orders them; what
+    """[N, outputs] of inputs [N, inputs], with ReLU between layers. weights: as `initial_weights` orders them; what
     points share is 1"""
     value = items
     for i, (rows, columns) in enumerate(shape.sizes):

@@ -1,6 +1,6 @@
 """Fields: density and colour at points of the box, by a hash grid and small networks (2.1).
 
-Points are the columns of matrices [B, C, 512] that networks read (`learning.mlp`): N is a multiple of 512. Densities
+Points are the columns of matrices [B, C, 512] that networks read (`networks.mlp`): N is a multiple of 512. Densities
 are per side of the box, so that a field does not know how large it is.
 """
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, TensorXf, UInt32
-from spacesim.learning import mlp
-from spacesim.learning.mlp import MlpShape, round_up_rows, sigmoid
+from spacesim.learning.networks import mlp, network
+from spacesim.learning.networks.network import MlpShape, round_up_rows, sigmoid
 from spacesim.learning.reflectance import COSINES, surface_cosines
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig
 from spacesim.nerf.fields.hashgrid import HashGrid
@@ -20,7 +20,7 @@ from spacesim.nerf.fields.hashgrid import HashGrid
 MAX_LOG_DENSITY = 12.0  #: e^12 a side: opaque within a hundred-thousandth of it
 
 Parameters = list[Float]
-"""A grid's table, then the weights of networks, as `mlp.initial_weights` orders them."""
+"""A grid's table, then the weights of networks, as `network.initial_weights` orders them."""
 
 
 @dataclass
@@ -28,7 +28,7 @@ class DensityTape:
     """What the adjoint of a density wants."""
 
     point: Array3f  #: [3, N]
-    layers: mlp.MlpTape  #: of the network
+    layers: network.MlpTape  #: of the network
     log_density: Float  #: [N]
 
 
@@ -48,7 +48,7 @@ class DensityField:
 
     def initial(self, rng: np.random.Generator) -> list[np.ndarray]:
         """`Parameters` to start from."""
-        return [self.grid.initial(rng), *mlp.initial_weights(self.shape, rng)]
+        return [self.grid.initial(rng), *network.initial_weights(self.shape, rng)]
 
     def look_up(self, parameters: Parameters, point: Array3f) -> tuple[Float, list[Float], DensityTape]:
         """(density [N] per side, 1 + features outputs, [N] each, tape) at points [3, N] of the box."""
@@ -86,7 +86,7 @@ class FieldTape:
     """What the adjoint of a field wants."""
 
     density: DensityTape  #: what the density's own adjoint wants
-    layers: mlp.MlpTape  #: of the colour network
+    layers: network.MlpTape  #: of the colour network
     color: list[Float]  #: [N] each
     normal: Array3f | None  #: [3, N] of any length, where there are some
     view: Array3f  #: [3, N]
@@ -125,7 +125,7 @@ class RadianceField:
 
     def initial(self, rng: np.random.Generator) -> list[np.ndarray]:
         """`Parameters` to start from."""
-        return [*self.density.initial(rng), *mlp.initial_weights(self.color, rng)]
+        return [*self.density.initial(rng), *network.initial_weights(self.color, rng)]
 
     def directions(self, view: Array3f, sun: Array3f | None) -> list[Float]:
         """The colour network's inputs for directions [3, N], unit: real spherical harmonics."""

@@ -11,7 +11,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
-from spacesim.learning.mlp import sigmoid
+from spacesim.learning.networks.network import sigmoid
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.surroundings import Surroundings, ray_count

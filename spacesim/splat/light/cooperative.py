@@ -16,8 +16,8 @@ from drjit import nn
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
-from spacesim.learning import mlp
-from spacesim.learning.mlp import MlpShape
+from spacesim.learning.networks import mlp, network
+from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.light.padded_batch import PaddedBatch
 
 AGREES = 2e-3  #: difference to single precision up to which `is_usable` accepts a network's sigmoid
@@ -55,7 +55,7 @@ class PackedNetwork:
 
 def pack(shape: MlpShape, weights: list[Float]) -> PackedNetwork:
     """Matrix and bias of each layer as `forward` reads them, half precision in the device's order, from weights as
-    `mlp.initial_weights` orders them. What is shared stands before the other inputs."""
+    `network.initial_weights` orders them. What is shared stands before the other inputs."""
     parts = []
     for i, (rows, columns) in enumerate(shape.sizes):
         matrix, bias = (np.array(weight) for weight in weights[1 + 2 * i : 3 + 2 * i])
@@ -98,7 +98,7 @@ def is_usable() -> bool:
 def _largest_difference() -> float:
     """Largest difference between sigmoids of a network's outputs."""
     shape, rng, count = MlpShape(19, 5, 3, 32, 3), np.random.default_rng(0), 300
-    weights = [upload(weight) for weight in mlp.initial_weights(shape, rng)]
+    weights = [upload(weight) for weight in network.initial_weights(shape, rng)]
     shared, rows = upload(rng.normal(size=5)), upload(rng.normal(size=19 * count))
     batch = PaddedBatch.of(count)
     run = recorded(

@@ -9,7 +9,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_fields
-from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
+from spacesim.learning.networks.network import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
 from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.encoding import Encoding

@@ -20,7 +20,7 @@ from spacesim.backend.last_made import LastMade
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array
-from spacesim.learning import mlp
+from spacesim.learning.networks import network
 from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
@@ -72,7 +72,7 @@ class Shading:
 class _PictureCache:
     """What pictures of one model have in common."""
 
-    first_layer: mlp.PartialLayer | None  #: what the field's first layer makes of the features
+    first_layer: network.PartialLayer | None  #: what the field's first layer makes of the features
     packed: cooperative.PackedNetwork | None  #: the field's network for `cooperative`, None where `first_layer` serves
     embedding: list[Float]  #: the mean one, Float [E] in a list, or nothing
 
@@ -91,7 +91,7 @@ class LightGradients:
 class LightModel:
     """The networks of a relightable model.
 
-    weights: Floats, the field's and then the refinement's, each as `mlp.initial_weights` orders them
+    weights: Floats, the field's and then the refinement's, each as `network.initial_weights` orders them
     frame: of its training
     embeddings: those of all training pictures, Float [V * E], in a list, or nothing where pictures have none
     """
@@ -113,9 +113,9 @@ class LightModel:
         """Fresh networks; the last layer of a refinement that corrects raw shadows starts at 0, so that these are where
         training starts, and so do the embeddings of `pictures` training pictures."""
         rng = np.random.default_rng([seed, 4])
-        weights = mlp.initial_weights(config.field.shape, rng)
+        weights = network.initial_weights(config.field.shape, rng)
         if config.refine:
-            weights += mlp.initial_weights(config.refine.shape, rng, last=0.0 if config.refine.residual else 1.0)
+            weights += network.initial_weights(config.refine.shape, rng, last=0.0 if config.refine.residual else 1.0)
         numbers = pictures * config.field.embeddings
         embeddings = [upload(np.zeros(numbers))] if config.field.embeddings else []
         return LightModel(config, [upload(weight) for weight in weights], frame, embeddings)

@@ -9,8 +9,8 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf, UInt32
-from spacesim.learning import mlp
-from spacesim.learning.mlp import round_up_rows
+from spacesim.learning.networks import mlp, network
+from spacesim.learning.networks.network import round_up_rows
 from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import (
@@ -75,8 +75,8 @@ class ShadingInputs:
 class ShadingTape:
     """What the adjoint needs of the forward pass."""
 
-    field: mlp.MlpTape  #: of the appearance field
-    refine: mlp.MlpTape | None  #: of the shadow refinement network, if there is one
+    field: network.MlpTape  #: of the appearance field
+    refine: network.MlpTape | None  #: of the shadow refinement network, if there is one
     colors: list[Float]  #: 3 arrays [M] before they are dimmed
     occlusion: list[Float]  #: the refined one [M] in a list, or nothing
     faces: list[Float]  #: of `sun_facing`, or nothing
@@ -115,7 +115,7 @@ def shade_picture(
     field_weights: list[Float],
     inputs: ShadingInputs,
     batch: PaddedBatch,
-    first_layer: mlp.PartialLayer | None,
+    first_layer: network.PartialLayer | None,
     packed: cooperative.PackedNetwork | None,
     sunlight: Sunlight,
 ) -> list[Float]:
@@ -167,7 +167,7 @@ def scatter_sunlight(
 @recorded
 def first_layer_of_features(
     field: FieldConfig, weights: list[Float], features: Float, batch: PaddedBatch
-) -> mlp.PartialLayer:
+) -> network.PartialLayer:
     items = batch.matrix(batch.block(features, 0, field.features), round_up_rows(field.features))
     return mlp.first_layer_part(field.shape, weights, items, field.features)
 
@@ -188,7 +188,7 @@ def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
 
 def _refine_occlusion(
     config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[list[Float], mlp.MlpTape | None]:
+) -> tuple[list[Float], network.MlpTape | None]:
     """([refined occlusion [M]] or [], tape of the refinement)."""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
     if not config.refine:
@@ -226,7 +226,7 @@ def adjoint(
     grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_output = batch.matrix([g * visibility * field_color_slope(config.decoding, c) for g, c in pairs])
     encoding = inputs.sun.field_encoding
-    ways = [mlp.WayBack(config.field.shape, field_weights, tape.field, encoding, grad_output)]
+    ways = [network.WayBack(config.field.shape, field_weights, tape.field, encoding, grad_output)]
     if config.refine:
         assert tape.refine is not None, "it was refined"
         grad_occlusion = -sum(
@@ -235,7 +235,7 @@ def adjoint(
         occlusion = tape.occlusion[0]
         grad_logit = batch.matrix([grad_occlusion * occlusion * (1 - occlusion)])
         encoding = inputs.sun.refine_encoding
-        ways.append(mlp.WayBack(config.refine.shape, refine_weights, tape.refine, encoding, grad_logit))
+        ways.append(network.WayBack(config.refine.shape, refine_weights, tape.refine, encoding, grad_logit))
     (grad_weights, grad_items), *of_refinement = mlp.backward_together(ways)
     by_encoding = []
     if config.field.embeddings or by_sun:
@@ -297,7 +297,7 @@ def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
 
 def _reflectances(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
     """Floats [M] in (0, 1): the albedo, then, where surfaces mirror, the specular reflectance, RGB each."""
-    return [mlp.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 6 if config.mirrors else 3)]
+    return [network.sigmoid(row) for row in batch.block(inputs.features, config.albedos, 6 if config.mirrors else 3)]
 
 
 def _emitted(
@@ -306,7 +306,7 @@ def _emitted(
     inputs: ShadingInputs,
     visibility: list[Float],
     batch: PaddedBatch,
-    input_layer: mlp.InputLayer | None = None,
+    input_layer: network.InputLayer | None = None,
 ) -> list[Float]:
     """What `emission` gives, or nothing. weights: of the field;  visibility: of each Gaussian in a list, or nothing
     for 1;  input_layer: of the field, if it is known"""
@@ -344,7 +344,7 @@ def _painted(
     visibility: list[Float],
     emitters: UInt32,
     gaussians: UInt32,
-    input_layer: mlp.InputLayer | None,
+    input_layer: network.InputLayer | None,
 ) -> list[Float]:
     """The light of the Gaussians that are `emitters`, three Floats, as the field paints them: mean of what is seen of
     each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the

@@ -9,7 +9,7 @@ from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
-from spacesim.learning.joined import Joined
+from spacesim.learning.networks.joined import Joined
 from spacesim.splat.raster.blend import forward
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
@@ -99,7 +99,7 @@ class DrawnView:
 
     splats: Splats  #: on the screen
     radii: Float | None  #: of `screen_radii`
-    lists: TileLists
+    lists: TileLists  #: of the splats
     pair_ends: UInt32 | UInt64  #: of the boxes
     channels: dict[str, int]  #: how many planes each name has
     blended: BlendResult  #: what `forward` leaves behind

@@ -18,7 +18,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import read_points, write_points
-from spacesim.learning.mlp import MlpShape
+from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.export.bake import bake
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig

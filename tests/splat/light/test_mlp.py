@@ -6,8 +6,8 @@ import pytest
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
-from spacesim.learning import mlp
-from spacesim.learning.mlp import MlpShape, round_up_rows
+from spacesim.learning.networks import mlp, network
+from spacesim.learning.networks.network import MlpShape, round_up_rows
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch
 
@@ -58,7 +58,7 @@ class Case:
     def __init__(self, shape: MlpShape, count: int) -> None:
         rng = np.random.default_rng(count)
         self.shape, self.count = shape, count
-        self.weights = mlp.initial_weights(shape, rng)
+        self.weights = network.initial_weights(shape, rng)
         self.shared = rng.normal(size=shape.shared).astype(np.float32)
         self.items = rng.normal(size=(shape.inputs, count)).astype(np.float32)
         self.grad_output = rng.normal(size=(shape.outputs, count)).astype(np.float32)
@@ -162,7 +162,7 @@ def test_columns_are_more_than_the_gaussians_and_whole_chunks(count, still):
 
 def test_weights_have_the_size_that_the_shape_says():
     for shape in SHAPES.values():
-        weights = mlp.initial_weights(shape, np.random.default_rng(0))
+        weights = network.initial_weights(shape, np.random.default_rng(0))
         assert sum(map(len, weights)) == shape.parameters
         assert shape.inputs <= shape.rows < shape.inputs + 4
         assert shape.rows % 4 == 0
@@ -226,7 +226,7 @@ def test_networks_that_go_back_together_have_the_same_gradients():
         items = batch.matrix([batch.pad_zeros(row) for row in rows], case.shape.rows)
         _, tape = mlp.forward(case.shape, weights, items, shared)
         grad_output = batch.matrix([batch.pad_zeros(row) for row in grad_rows])
-        ways.append(mlp.WayBack(case.shape, weights, tape, shared, grad_output))
+        ways.append(network.WayBack(case.shape, weights, tape, shared, grad_output))
         alone.append(mlp.backward(case.shape, weights, tape, shared, grad_output))
     for one, other in zip(mlp.backward_together(ways), alone, strict=True):
         np.testing.assert_array_equal(numbers(one[1]), numbers(other[1]))

@@ -19,7 +19,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, look_at, normalize
-from spacesim.learning import mlp
+from spacesim.learning.networks import mlp, network
 from spacesim.learning.reflectance import LOBES
 from spacesim.splat.export.html.sunlight import octahedral_directions, quantized
 from spacesim.splat.light.field import field_color
@@ -123,7 +123,7 @@ class _Cosines:
         numbers = [*np.array(field.view(ad.Array3f(0, 0, 1))).ravel(), *condition]
         inputs = ad.Float([float(number) for number in numbers])  # no constants of a kernel: others compile nothing
         rows = [dr.gather(ad.Float, inputs, ad.UInt32(i)) for i in range(len(numbers))]
-        items = batch.matrix(rows, mlp.round_up_rows(len(rows)))
+        items = batch.matrix(rows, network.round_up_rows(len(rows)))
         shared = self.light.encode_sun(None).field_encoding
         output, _ = mlp.forward(field.shape, self.weights, items, shared, self.first_layer)
         colors = [field_color(self.light.config.decoding, value) for value in output]

@@ -8,7 +8,7 @@ import drjit as dr
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_fields
-from spacesim.learning.mlp import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
+from spacesim.learning.networks.network import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
 from spacesim.splat.light.encoding import Encoding
 
 SURE = 0.02  #: a raw occlusion nearer to 0 or 1 counts as this near: the network can still change it

@@ -1,0 +1,1 @@
+"""Small fully connected networks over many items at once."""

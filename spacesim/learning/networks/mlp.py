@@ -1,0 +1,159 @@
+"""Small fully connected networks over N items at once: forward, and the adjoint of that by hand.
+
+Items are the columns of B matrices [rows, m] in memory (`PaddedBatch`): N = B m. What all items share, such as the
+direction of the Sun, enters the first layer as one vector: its products are made once instead of N times.
+"""
+
+import drjit as dr
+
+from spacesim.backend import ad, select
+from spacesim.backend.arrays import Float, TensorXf
+from spacesim.learning.networks import warps
+from spacesim.learning.networks.network import (
+    InputLayer,
+    MlpShape,
+    MlpTape,
+    PartialLayer,
+    WayBack,
+    product,
+    round_up_rows,
+)
+
+
+def first_layer_part(shape: MlpShape, weights: list[Float], items: TensorXf, inputs: int) -> PartialLayer:
+    """Of the first `inputs` inputs, items: TensorXf [B, `round_up_rows(inputs)`, m], 0 in the rows that fill them
+    up."""
+    rows, stored = shape.sizes[0]
+    matrix = _columns(weights[1], rows, stored, round_up_rows(inputs), inputs)
+    return PartialLayer(product(ad.TensorXf(matrix, (rows, round_up_rows(inputs))), items), inputs)
+
+
+def forward(
+    shape: MlpShape,
+    weights: list[Float],
+    items: TensorXf,
+    shared: Float,
+    first_layer: PartialLayer | None = None,
+    input_layer: InputLayer | None = None,
+) -> tuple[list[Float], MlpTape]:
+    """(outputs, [N] each, the tape that `backward` wants): ReLU between layers, nothing after the last.
+
+    weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere;
+    shared: Float [shared];  first_layer: where there is some, items are the other inputs alone, and the tape is of no
+    use;  input_layer: of the tape of other items with the same weights, and what they share
+    """
+    if input_layer is None:
+        input_layer = _input_layer(shape, weights, shared, first_layer.inputs if first_layer else 0)
+    tape, by_warps = [items], select() == "cuda" and first_layer is None
+    for i, (rows, columns) in enumerate(shape.sizes):
+        matrix, bias = weights[1 + 2 * i : 3 + 2 * i]
+        is_last = i == shape.layers - 1
+        if i == 0:
+            value, bias = product(input_layer.matrix, items), input_layer.bias
+        elif is_last and by_warps and warps.is_few(rows):
+            return warps.outputs_of_few(matrix, bias, tape[-1]), MlpTape(tape, input_layer)
+        else:
+            value = product(ad.TensorXf(matrix, (rows, columns)), tape[-1])
+        if by_warps and not is_last:
+            tape.append(warps.activated(value, bias))
+            continue
+        value += ad.TensorXf(bias, (rows, 1))
+        if first_layer and i == 0:
+            value += first_layer.values
+        if not is_last:
+            tape.append(dr.maximum(value, 0))
+    return [_row(value, i) for i in range(shape.outputs)], MlpTape(tape, input_layer)
+
+
+def backward(
+    shape: MlpShape, weights: list[Float], tape: MlpTape, shared: Float, grad_output: TensorXf
+) -> tuple[list[Float], TensorXf]:
+    """(gradients of the weights, gradient of the items [B, `shape.rows`, m]) from grad_output: TensorXf
+    [B, outputs, m].
+
+    Sums over N are sums over the columns of each matrix, all at once, then over the matrices, each in a fixed order:
+    the same bits in every run.
+    """
+    return backward_together([WayBack(shape, weights, tape, shared, grad_output)])[0]
+
+
+def backward_together(ways: list[WayBack]) -> list[tuple[list[Float], TensorXf]]:
+    """`backward` of networks whose items are the columns of as many matrices: they share the kernels that are small."""
+    if select() == "llvm":
+        return [_backward(way) for way in ways]
+    matrices, _, m = ways[0].grad_output.shape
+    sums = warps.WarpSums(matrices, m, sum(warps.rows_summed(way.shape) for way in ways))
+    parts, grad_items = zip(*(warps.backward(way, sums) for way in ways), strict=True)
+    return list(zip(warps.totals(ways, list(parts), sums), grad_items, strict=True))
+
+
+def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:
+    """`backward` on LLVM."""
+    shape, values, gradient = way.shape, way.tape.values, way.grad_output
+    parts: list[Float] = []  # of the last layer first
+    for i in reversed(range(shape.layers)):
+        parts.append(dr.block_reduce(dr.ReduceOp.Add, gradient.array, gradient.shape[2]))
+        parts.append(product(gradient, values[i], Bt=True).array)
+        matrix = way.tape.input_layer.matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
+        gradient = product(matrix, gradient, At=True)
+        if i > 0:
+            gradient = dr.select(values[i] > 0, gradient, 0)
+    return _totals(way, parts[::-1]), gradient
+
+
+def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float]) -> Float:
+    """Float [shared]: gradient of what all items share, from the gradients of the weights that `backward` gives: it
+    enters where the bias of the first layer does."""
+    rows = shape.sizes[0][0]
+    grad_bias = ad.TensorXf(gradients[2], (rows, 1))
+    by_shared = product(ad.TensorXf(weights[0], (rows, shape.shared)), grad_bias, At=True)
+    return by_shared.array
+
+
+def _input_layer(shape: MlpShape, weights: list[Float], shared: Float, first: int) -> InputLayer:
+    """Without the first `first` inputs, in one kernel."""
+    rows, stored = shape.sizes[0]
+    count, columns = stored - first, round_up_rows(stored - first)
+    place = dr.arange(ad.UInt32, rows * (columns + 1))
+    row, column = place // (columns + 1), place % (columns + 1)
+    is_bias = column == columns
+    value = dr.gather(ad.Float, weights[1], row * stored + first + column, column < count)
+    with_shared = ad.Float(0)
+    for i in range(shape.shared):
+        weight = dr.gather(ad.Float, weights[0], row * shape.shared + i, is_bias)
+        with_shared += weight * dr.gather(ad.Float, shared, ad.UInt32(i))
+    matrix, bias = dr.empty(ad.Float, rows * columns), dr.empty(ad.Float, rows)
+    dr.scatter(matrix, value, row * columns + column, ~is_bias, dr.ReduceMode.NoConflicts)
+    of_bias = dr.gather(ad.Float, weights[2], row, is_bias) + with_shared
+    dr.scatter(bias, of_bias, row, is_bias, dr.ReduceMode.NoConflicts)
+    dr.eval(matrix, bias)
+    return InputLayer(ad.TensorXf(matrix, (rows, columns)), bias)
+
+
+def _columns(matrix: Float, rows: int, stored: int, row_count: int, count: int) -> Float:
+    """Float [rows * row_count] of [rows * stored]: the first `count` columns, then columns of 0."""
+    if stored == row_count == count:
+        return matrix
+    place = dr.arange(ad.UInt32, rows * row_count)
+    row, column = place // row_count, place % row_count
+    return dr.gather(ad.Float, matrix, row * stored + column, column < count)
+
+
+def _totals(way: WayBack, parts: list[Float]) -> list[Float]:
+    """Gradients of the weights from those of each matrix, by products on LLVM."""
+    matrices = way.grad_output.shape[0]
+    ones = dr.full(ad.TensorXf, 1, (1, matrices))
+    dr.make_opaque(ones)  # once for all products
+    sizes = [dr.width(part) // matrices for part in parts]
+    sums = [product(ones, ad.TensorXf(part, (matrices, size))).array for part, size in zip(parts, sizes, strict=True)]
+    rows, columns = way.shape.sizes[0]
+    outer = ad.TensorXf(sums[1], (rows, 1)) * ad.TensorXf(way.shared, (1, way.shape.shared))
+    sums[0] = _columns(sums[0], rows, way.shape.rows, columns, columns)
+    return [outer.array, *sums]
+
+
+def _row(matrices: TensorXf, i: int) -> Float:
+    """Row i [B * m] of a TensorXf [B, C, m]."""
+    count, rows, m = matrices.shape
+    column = dr.arange(ad.UInt32, count * m)
+    return dr.gather(ad.Float, matrices.array, (column // m * rows + i) * m + column % m)
