@@ -15,6 +15,7 @@ from spacesim.learning.networks.network import (
     MlpTape,
     PartialLayer,
     WayBack,
+    columns_of,
     product,
     round_up_rows,
 )
@@ -24,7 +25,7 @@ def first_layer_part(shape: MlpShape, weights: list[Float], items: TensorXf, inp
     """Of the first `inputs` inputs, items: TensorXf [B, `round_up_rows(inputs)`, m], 0 in the rows that fill them
     up."""
     rows, stored = shape.sizes[0]
-    matrix = _columns(weights[1], rows, stored, round_up_rows(inputs), inputs)
+    matrix = columns_of(weights[1], rows, stored, round_up_rows(inputs), inputs)
     return PartialLayer(product(ad.TensorXf(matrix, (rows, round_up_rows(inputs))), items), inputs)
 
 
@@ -94,7 +95,7 @@ def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:
     for i in reversed(range(shape.layers)):
         parts.append(dr.block_reduce(dr.ReduceOp.Add, gradient.array, gradient.shape[2]))
         parts.append(product(gradient, values[i], Bt=True).array)
-        matrix = way.tape.input_layer.matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
+        matrix = way.input_matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
         gradient = product(matrix, gradient, At=True)
         if i > 0:
             gradient = dr.select(values[i] > 0, gradient, 0)
@@ -130,15 +131,6 @@ def _input_layer(shape: MlpShape, weights: list[Float], shared: Float, first: in
     return InputLayer(ad.TensorXf(matrix, (rows, columns)), bias)
 
 
-def _columns(matrix: Float, rows: int, stored: int, row_count: int, count: int) -> Float:
-    """Float [rows * row_count] of [rows * stored]: the first `count` columns, then columns of 0."""
-    if stored == row_count == count:
-        return matrix
-    place = dr.arange(ad.UInt32, rows * row_count)
-    row, column = place // row_count, place % row_count
-    return dr.gather(ad.Float, matrix, row * stored + column, column < count)
-
-
 def _totals(way: WayBack, parts: list[Float]) -> list[Float]:
     """Gradients of the weights from those of each matrix, by products on LLVM."""
     matrices = way.grad_output.shape[0]
@@ -148,7 +140,7 @@ def _totals(way: WayBack, parts: list[Float]) -> list[Float]:
     sums = [product(ones, ad.TensorXf(part, (matrices, size))).array for part, size in zip(parts, sizes, strict=True)]
     rows, columns = way.shape.sizes[0]
     outer = ad.TensorXf(sums[1], (rows, 1)) * ad.TensorXf(way.shared, (1, way.shape.shared))
-    sums[0] = _columns(sums[0], rows, way.shape.rows, columns, columns)
+    sums[0] = columns_of(sums[0], rows, way.shape.rows, columns, columns)
     return [outer.array, *sums]
 
 

@@ -6,11 +6,13 @@ from typing import cast
 import drjit as dr
 import numpy as np
 
+from spacesim.backend import ad
 from spacesim.backend.arrays import Float, TensorXf
 
 MAX_FEATURES, MAX_WIDTH, MAX_LAYERS = 1024, 4096, 32
 """Of a network: numbers a Gaussian, units of a layer, layers, far above any that pays."""
 ALIGNED = 4  #: rows of matrices are a multiple of it
+TILE = 64  #: rows of a product that are computed at once
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class PartialLayer:
 
 @dataclass
 class InputLayer:
-    """The first layer, as items are read: all that do not change with them."""
+    """The first layer as kernels read it, the same for all items."""
 
     matrix: TensorXf  #: [width, rows of the items], 0 in the columns that fill these up
     bias: Float  #: [width], with what the layer makes of what is shared
@@ -93,6 +95,18 @@ class WayBack:
     tape: MlpTape  #: of `mlp.forward`
     shared: Float  #: [shared], what its items have in common
     grad_output: TensorXf  #: [B, outputs, m], by what it says
+    #: gradients of so many first rows of the items are wanted, at least, or all: tiles of others are not computed
+    wanted: int | None = None
+
+    @property
+    def input_matrix(self) -> TensorXf:
+        """Of the first layer, as far as gradients of the items want it."""
+        rows, columns = self.shape.sizes[0]
+        wanted = columns if self.wanted is None else self.wanted
+        if -(-wanted // TILE) == -(-columns // TILE):
+            return self.tape.input_layer.matrix
+        wanted = round_up_rows(wanted)
+        return ad.TensorXf(columns_of(self.weights[1], rows, columns, wanted, wanted), (rows, wanted))
 
 
 def round_up_rows(rows: int) -> int:
@@ -104,3 +118,12 @@ def round_up_rows(rows: int) -> int:
 def product(left: TensorXf, right: TensorXf, At: bool = False, Bt: bool = False) -> TensorXf:
     """`dr.matmul` of two tensors, which it says to give an object."""
     return cast(TensorXf, dr.matmul(left, right, At=At, Bt=Bt))
+
+
+def columns_of(matrix: Float, rows: int, stored: int, row_count: int, count: int) -> Float:
+    """Float [rows * row_count] of [rows * stored]: the first `count` columns, then columns of 0."""
+    if stored == row_count == count:
+        return matrix
+    place = dr.arange(ad.UInt32, rows * row_count)
+    row, column = place // row_count, place % row_count
+    return dr.gather(ad.Float, matrix, row * stored + column, column < count)

@@ -140,7 +140,7 @@ def backward(way: WayBack, sums: WarpSums) -> tuple[list[Part], TensorXf]:
         else:
             parts += [sums.of_rows(gradient) if by_bias is None else by_bias]
             parts.append(product(gradient, values[i], Bt=True).array)
-            matrix = way.tape.input_layer.matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], (rows, columns))
+            matrix = way.input_matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], (rows, columns))
             gradient = product(matrix, gradient, At=True)
             before = at.load(gradient)
         if i > 0:

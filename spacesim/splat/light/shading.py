@@ -226,7 +226,8 @@ def adjoint(
     grad_shown = inputs.sun.left([batch.pad_zeros(gradient) for gradient in grad_visibility])
     grad_output = batch.matrix([g * visibility * field_color_slope(config.decoding, c) for g, c in pairs])
     encoding = inputs.sun.field_encoding
-    ways = [network.WayBack(config.field.shape, field_weights, tape.field, encoding, grad_output)]
+    wanted = None if config.field.surface or by_sun else config.field.features
+    ways = [network.WayBack(config.field.shape, field_weights, tape.field, encoding, grad_output, wanted)]
     if config.refine:
         assert tape.refine is not None, "it was refined"
         grad_occlusion = -sum(

@@ -232,3 +232,20 @@ def test_networks_that_go_back_together_have_the_same_gradients():
         np.testing.assert_array_equal(numbers(one[1]), numbers(other[1]))
         for gradient, same in zip(one[0], other[0], strict=True):
             np.testing.assert_array_equal(numbers(gradient), numbers(same))
+
+
+@pytest.mark.usefixtures("_ways")
+def test_gradients_of_first_items_alone_are_the_same():
+    case = Case(MlpShape(130, 2, 3, 12, 3), CHUNK + 1)
+    weights, rows, shared, grad_rows, batch = case.device()
+    _, tape = mlp.forward(case.shape, weights, batch.matrix([batch.pad_zeros(row) for row in rows], 132), shared)
+    grad_output = batch.matrix([batch.pad_zeros(row) for row in grad_rows])
+    way = network.WayBack(case.shape, weights, tape, shared, grad_output, wanted=59)
+    [(gradients, some)], (expected, whole) = (
+        mlp.backward_together([way]),
+        mlp.backward(case.shape, weights, tape, shared, grad_output),
+    )
+    assert (some.shape[1], whole.shape[1]) == (60, 132)
+    np.testing.assert_allclose(numbers(some), numbers(whole)[:, :60], atol=1e-6)
+    for gradient, same in zip(gradients, expected, strict=True):
+        np.testing.assert_array_equal(numbers(gradient), numbers(same))
