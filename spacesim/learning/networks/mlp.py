@@ -95,7 +95,7 @@ def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:
     for i in reversed(range(shape.layers)):
         parts.append(dr.block_reduce(dr.ReduceOp.Add, gradient.array, gradient.shape[2]))
         parts.append(product(gradient, values[i], Bt=True).array)
-        matrix = way.input_matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
+        matrix = way.input_matrix() if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
         gradient = product(matrix, gradient, At=True)
         if i > 0:
             gradient = dr.select(values[i] > 0, gradient, 0)

@@ -98,11 +98,10 @@ class WayBack:
     #: gradients of so many first rows of the items are wanted, at least, or all: tiles of others are not computed
     wanted: int | None = None
 
-    @property
     def input_matrix(self) -> TensorXf:
         """Of the first layer, as far as gradients of the items want it."""
         rows, columns = self.shape.sizes[0]
-        wanted = columns if self.wanted is None else self.wanted
+        wanted = columns if self.wanted is None else max(self.wanted, 1)
         if -(-wanted // TILE) == -(-columns // TILE):
             return self.tape.input_layer.matrix
         wanted = round_up_rows(wanted)

@@ -89,7 +89,7 @@ def activated(values: TensorXf, bias: Float) -> TensorXf:
 
 
 def outputs_of_few(matrix: Float, bias: Float, items: TensorXf) -> list[Float]:
-    """[B * m] each: `_product` of a matrix of few rows, Float [rows * C], with items [B, C, m], and the bias [rows], in
+    """[B * m] each: `product` of a matrix of few rows, Float [rows * C], with items [B, C, m], and the bias [rows], in
     one pass over the items, a part of the kernel that reads it."""
     matrices, columns, m = items.shape
     rows, turn = dr.width(bias), _turn(columns)
@@ -123,15 +123,15 @@ def backward(way: WayBack, sums: WarpSums) -> tuple[list[Part], TensorXf]:
     shape, values, gradient = way.shape, way.tape.values, way.grad_output
     parts: list[Part] = []  # of the last layer first
     by_bias: int | None = None
-    for i in reversed(range(shape.layers)):
+    for i in reversed(range(1, shape.layers)):
         rows, columns = shape.sizes[i]
-        at = Fours(*values[i].shape)
-        if i > 0 and is_few(rows):
+        at, weights = Fours(*values[i].shape), way.weights[1 + 2 * i]
+        if is_few(rows):
             few, first = [at.load_row(gradient, row) for row in range(rows)], sums.take(rows * columns)
             before = ad.Array4f(0)
             for row, of_row in enumerate(few):
                 sums.add(of_row * at.load(values[i]), at, first + row * columns + at.row)
-                before = dr.fma(dr.gather(ad.Float, way.weights[1 + 2 * i], row * columns + at.row), of_row, before)
+                before = dr.fma(dr.gather(ad.Float, weights, row * columns + at.row), of_row, before)
             if by_bias is None:
                 by_bias = sums.take(rows)
                 for row, of_row in enumerate(few):
@@ -140,15 +140,14 @@ def backward(way: WayBack, sums: WarpSums) -> tuple[list[Part], TensorXf]:
         else:
             parts += [sums.of_rows(gradient) if by_bias is None else by_bias]
             parts.append(product(gradient, values[i], Bt=True).array)
-            matrix = way.input_matrix if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], (rows, columns))
-            gradient = product(matrix, gradient, At=True)
-            before = at.load(gradient)
-        if i > 0:
-            masked, by_bias = dr.select(at.load(values[i]) > 0, before, 0), sums.take(columns)
-            sums.add(masked, at, by_bias + at.row)
-            gradient = at.store(masked)
-            sums.evaluate(gradient)
-    return parts[::-1], gradient
+            before = at.load(product(ad.TensorXf(weights, (rows, columns)), gradient, At=True))
+        masked, by_bias = dr.select(at.load(values[i]) > 0, before, 0), sums.take(columns)
+        sums.add(masked, at, by_bias + at.row)
+        gradient = at.store(masked)
+        sums.evaluate(gradient)
+    parts += [sums.of_rows(gradient) if by_bias is None else by_bias]
+    parts.append(product(gradient, values[0], Bt=True).array)
+    return parts[::-1], product(way.input_matrix(), gradient, At=True)
 
 
 def totals(ways: list[WayBack], parts: list[list[Part]], sums: WarpSums) -> list[list[Float]]:

@@ -94,23 +94,37 @@ def list_view(
 
 
 @dataclass
+class BlendTape:
+    """What blending a view leaves behind for its way back."""
+
+    splats: Splats  #: what was blended
+    lists: TileLists  #: which splats each tile has
+    blended: BlendResult  #: what `forward` leaves behind
+
+
+def blend_view(
+    splats: Splats, values: dict[str, list[Float]], lists: TileLists, camera: Pinhole
+) -> tuple[BlendTape, dict[str, int]]:
+    """Blend what `find_view_boxes` and a view's light give. Also how many planes each name has."""
+    planes = [value for group in values.values() for value in group]
+    blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
+    return BlendTape(splats, lists, blended), {name: len(group) for name, group in values.items()}
+
+
+@dataclass
 class DrawnView:
     """A view that was listed and blended at once, without light."""
 
-    splats: Splats  #: on the screen
     radii: Float | None  #: of `screen_radii`
-    lists: TileLists  #: of the splats
     pair_ends: UInt32 | UInt64  #: of the boxes
+    tape: BlendTape  #: what its way back reads
     channels: dict[str, int]  #: how many planes each name has
-    blended: BlendResult  #: what `forward` leaves behind
 
 
 def draw_view(view: ViewRequest, limit: UInt32, capacities: Capacities, grid: Grid) -> DrawnView:
     """`list_view`, and what it lists blended."""
     splats, values, radii, lists, pair_ends = list_view(view, limit, capacities, grid)
-    planes = [value for group in values.values() for value in group]
-    blended = forward(splats, planes, lists, view.camera.width, view.camera.height, adjoint=True)
-    return DrawnView(splats, radii, lists, pair_ends, {name: len(group) for name, group in values.items()}, blended)
+    return DrawnView(radii, pair_ends, *blend_view(splats, values, lists, view.camera))
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:

@@ -182,8 +182,7 @@ class Trainer(TrainingLoop):
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
         attraction = self._attraction(view)
         target = self._target_image(number, view, attraction)
-        grad_rows = self._add_attraction(rows, view, attraction) if attraction else []
-        asked = rows, degree, view, target, watched, grad_rows
+        asked = rows, degree, view, target, watched
         drawn, loss, grad_splats, result = self._gradients(*asked)
         if not view_pass.pairs.all_fit():
             del drawn, loss, grad_splats, result  # of lists that are empty, and memory is short
@@ -192,25 +191,20 @@ class Trainer(TrainingLoop):
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
             self.strategy.observe(view_pass.watched(drawn, grad_splats))
+        if attraction:
+            result.add_to_rows(self._add_attraction(rows, view, attraction))
         self.pictures.learn_sun(self.iteration, view, result.by_sun)
         return result
 
     def _gradients(
-        self,
-        rows: list[Float],
-        degree: int,
-        view: TrainingView,
-        target: TargetImage,
-        watched: bool,
-        grad_rows: list[Float],
+        self, rows: list[Float], degree: int, view: TrainingView, target: TargetImage, watched: bool
     ) -> tuple[RenderedView, ViewLoss, SplatGradients, ViewResult]:
         """Of a view: what was drawn, its loss, gradients by its splats, what it teaches. Changes nothing."""
         view_pass, downscale = self._view_pass, self.config.downscale(self.iteration)
         drawn = view_pass.forward(self.gaussians, rows, self.light, view, degree, downscale, watched)
         loss = view_pass.loss(drawn, target, view.camera)
         grad_splats = view_pass.backward(drawn, loss, absolute=watched)
-        result = view_pass.to_gradients(drawn, loss, grad_splats, self.light, grad_rows)
-        return drawn, loss, grad_splats, result
+        return drawn, loss, grad_splats, view_pass.to_gradients(drawn, loss, grad_splats, self.light)
 
     def _warming(self, index: int) -> bool:
         """Whether the warm start keeps densification off in step number `index`, the first of which is 0."""

@@ -16,23 +16,23 @@ from spacesim.backend.upload import held
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.raster.adjoint import SplatGradients
-from spacesim.splat.raster.blend import backward, forward
+from spacesim.splat.raster.blend import backward
 from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import lists_of_boxes
 from spacesim.splat.raster.lists.capacity import Extent
-from spacesim.splat.raster.lists.tiles import TileLists
-from spacesim.splat.raster.project import Pinhole, Splats
-from spacesim.splat.raster.records import BlendResult
+from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
+    BlendTape,
     LossSettings,
     TargetImage,
     ViewRequest,
     ViewSplats,
+    blend_view,
     draw_view,
     find_view_boxes,
     list_view,
@@ -42,15 +42,6 @@ from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
 KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
-
-
-@dataclass
-class BlendTape:
-    """What blending a view leaves behind for its way back."""
-
-    splats: Splats  #: what was blended
-    lists: TileLists  #: which splats each tile has
-    blended: BlendResult  #: what `forward` leaves behind
 
 
 @dataclass
@@ -93,6 +84,11 @@ class ViewResult:
     loss: Float  #: Float of width 1
     by_networks: list[Float] = field(default_factory=list)  #: by their weights, then by the pictures' embeddings
     by_sun: Float | None = None  #: [3], by its direction, of pictures whose Suns are unknown
+
+    def add_to_rows(self, grad_rows: list[Float]) -> None:
+        """Gradients of the Gaussians' first rows, Floats [N], that come from elsewhere."""
+        assert self.gradients is not None, "gradients are read once"
+        self.gradients.grad_rows = grad_rows
 
     def take_gradients(self) -> ViewGradients:
         """The gradients, which are not held any longer."""
@@ -154,10 +150,9 @@ class ViewPass:
         else:
             listing = held(expected, "pairs"), extent.capacities(expected), grid
             if light is None:
-                view_drawn = self._draw(asked, *listing)
-                pairs.check(extent, view_drawn.pair_ends, expected)
-                tape = BlendTape(view_drawn.splats, view_drawn.lists, view_drawn.blended)
-                return RenderedView(camera, downscale, view_drawn.radii, view_drawn.channels, None, tape)
+                whole = self._draw(asked, *listing)
+                pairs.check(extent, whole.pair_ends, expected)
+                return RenderedView(camera, downscale, whole.radii, whole.channels, None, whole.tape)
             splats, values, radii, lists, pair_ends = self._list(asked, *listing)
             pairs.check(extent, pair_ends, expected)
         of_sun = self.pairs.of_view("sun", view.index)
@@ -169,10 +164,8 @@ class ViewPass:
         if drawn is not None:  # after shading, which needs memory of its own
             lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
             del drawn
-        planes = [value for group in values.values() for value in group]
-        blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
-        channels = {name: len(group) for name, group in values.items()}
-        return RenderedView(camera, downscale, radii, channels, shading, BlendTape(splats, lists, blended))
+        tape, channels = blend_view(splats, values, lists, camera)
+        return RenderedView(camera, downscale, radii, channels, shading, tape)
 
     def _camera(self, camera: Camera, downscale: int) -> Pinhole:
         """With as many pixels as are blended of a view. A new array each time: two views of a step may be one, and no
@@ -211,24 +204,16 @@ class ViewPass:
         return self._screen_sizes[size]
 
     def to_gradients(
-        self,
-        drawn: RenderedView,
-        loss: ViewLoss,
-        grad_splats: SplatGradients,
-        light: LightModel | None,
-        grad_rows: list[Float],
+        self, drawn: RenderedView, loss: ViewLoss, grad_splats: SplatGradients, light: LightModel | None
     ) -> ViewResult:
-        """What the view teaches, back through its light. grad_rows: gradients of the Gaussians' first rows that come
-        from elsewhere, none at all or some"""
+        """What the view teaches, back through its light."""
         grad_values = _group_by_name(grad_splats.features, drawn.channels)
         if drawn.shading is None or light is None:
-            return ViewResult(
-                ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_rows=grad_rows), loss.value
-            )
+            return ViewResult(ViewGradients(drawn.camera, grad_splats.splats, grad_values), loss.value)
         grad_visibility = grad_values.pop("visibility", [None])[0]
         by_sun = self.config.sun == "unknown"
         grad_light = light.adjoint(drawn.shading, grad_values.pop("color"), grad_visibility, by_sun)
-        gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features, grad_rows)
+        gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
 

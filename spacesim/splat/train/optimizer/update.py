@@ -2,7 +2,8 @@
 
 A part (`adam.parts`) is a few rows and a recorded function. The rows and moments that it replaces go at once: a
 step holds all of them once, and only those of a part twice (docs/research/memory.md). Many rows in one kernel were also
-slower on a CPU. Where kernels take less time than to ask for a function, all parts are one.
+slower on a CPU. On CUDA, where kernels take less time than to ask for a function, all parts are one of few Gaussians,
+and of those with light, whose networks take more memory than that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +25,7 @@ from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
 from spacesim.splat.train.stages import mean, shape_values
 
-FEW = {"cuda": 2**17, "llvm": 0}  #: Gaussians, at most, all of whose parts are one recorded function
+AT_ONCE = 2**15  #: Gaussians with harmonics, at most, all of whose parts are one recorded function on CUDA
 Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
 
 
@@ -46,6 +47,7 @@ class _Taught:
 
     #: of each view its camera, and gradients by its splats, by what was blended, and of the first rows
     views: list[tuple[Pinhole, Splats, dict[str, list[Float]], list[Float]]]
+    grad_features: list[Float]  #: [F * N] of each view, or nothing
     degree: int  #: of the harmonics that were drawn
     factors: Float  #: [2 + R], Adam's two corrections and the step size of each row
     penalties: Mapping[str, Float]  #: weights by name
@@ -78,9 +80,9 @@ class Update:
         penalties: Mapping[str, Float],
         largest: Sequence[Float] = (),
     ) -> None:
-        """Replace the parameters and their moments, part by part.
+        """Replace the parameters and their moments.
 
-        views: emptied on the way, so that gradients go once they are read
+        views: emptied, so that gradients go once they are read
         factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name
         largest: ln of metres, no scale gets larger, a Float of width 1 in a list, or nothing
 
@@ -88,50 +90,55 @@ class Update:
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
-        of_views = [(view.camera, view.grad_splats, view.grad_values, view.grad_rows) for view in views]
-        fixed = self.antialiased, self.scale, self.surfels
-        taught = _Taught(of_views, degree, factors, penalties, list(largest), *fixed)
-        grad_features = [view.grad_features for view in views if view.grad_features is not None]
+        taught = _Taught(
+            views=[(view.camera, view.grad_splats, view.grad_values, view.grad_rows) for view in views],
+            grad_features=[view.grad_features for view in views if view.grad_features is not None],
+            degree=degree,
+            factors=factors,
+            penalties=penalties,
+            largest=list(largest),
+            antialiased=self.antialiased,
+            scale=self.scale,
+            surfels=self.surfels,
+        )
         views.clear()
         stops = [part.stop for part in optimizer.slices if part.start < OWN + 3 * (degree + 1) ** 2]
-        if gaussians.count <= FEW[select()]:
+        if moves_at_once(gaussians):
             packed = list(zip(optimizer.arrays, optimizer.layouts, strict=True))[: len(stops)]
-            of_features = [optimizer.features, grad_features] if grad_features else []
-            parts, moved_features = self._all(rows, stops, packed, of_features, taught)
-            for number, step in enumerate(parts):
-                _replace(gaussians, optimizer, rows, number, *step)
+            parts, features = self._all(rows, stops, packed, optimizer.features, taught)
+            for number, (moved, moments) in enumerate(parts):
+                _replace(gaussians, optimizer, rows, number, moved, moments)
         else:
-            moved_features = self._part_by_part(gaussians, optimizer, rows, stops, grad_features, taught)
-        if moved_features:
-            rows[-1], *optimizer.features = moved_features
+            features = self._part_by_part(gaussians, optimizer, rows, stops, taught)
+        if features:
+            rows[-1], *optimizer.features = features
             gaussians.replace(rows)
 
     def _part_by_part(
-        self,
-        gaussians: Gaussians,
-        optimizer: Adam,
-        rows: list[Float],
-        stops: list[int],
-        grad_features: list[Float],
-        taught: "_Taught",
+        self, gaussians: Gaussians, optimizer: Adam, rows: list[Float], stops: list[int], taught: _Taught
     ) -> list[Float]:
         """See `_move_all`: replaces all but the features, which are returned."""
         means, cameras, factors = rows[:3], [camera for camera, *_ in taught.views], taught.factors
         packed = optimizer.arrays[0], optimizer.layouts[0]
-        grad_sums, *own = self._own(rows, stops[0], packed, taught)
-        del packed
+        grad_sums, moved, moments = self._own(rows, stops[0], packed, taught)
         taught.views.clear()
-        _replace(gaussians, optimizer, rows, 0, *own)
-        del own
-        if grad_features:
-            return self._features(rows[-1], optimizer.features, grad_features, factors)
+        _replace(gaussians, optimizer, rows, 0, moved, moments)
+        del packed, moved, moments
+        if taught.grad_features:
+            return self._features(rows[-1], optimizer.features, taught.grad_features, factors)
         for number, (start, stop) in enumerate(pairwise(stops), 1):
-            packed = optimizer.arrays[number], optimizer.layouts[number]
-            first = (start - OWN) // 3
-            step = self._harmonics(rows[start:stop], packed, first, taught.degree, means, cameras, grad_sums, factors)
-            del packed
-            _replace(gaussians, optimizer, rows, number, *step)
+            packed, first = (optimizer.arrays[number], optimizer.layouts[number]), (start - OWN) // 3
+            moved, moments = self._harmonics(
+                rows[start:stop], packed, first, taught.degree, means, cameras, grad_sums, factors
+            )
+            _replace(gaussians, optimizer, rows, number, moved, moments)
+            del packed, moved, moments
         return []
+
+
+def moves_at_once(gaussians: Gaussians) -> bool:
+    """Whether all parts are one recorded function."""
+    return select() == "cuda" and (gaussians.features is not None or gaussians.count <= AT_ONCE)
 
 
 def _replace(
@@ -146,19 +153,20 @@ def _replace(
 
 
 def _move_all(
-    rows: list[Float], stops: list[int], packed: list[Packed], of_features: list[list[Float]], taught: _Taught
+    rows: list[Float], stops: list[int], packed: list[Packed], of_features: list[Float], taught: _Taught
 ) -> tuple[list[tuple[list[Float], list[Float]]], list[Float]]:
-    """(rows and moments of each part, those of the features or nothing). stops: where parts end;  of_features: moments
-    and gradients of the features, or nothing"""
-    grad_sums, *own = _move_own(rows, stops[0], packed[0], taught)
-    steps = [(own[0], own[1])]
-    if of_features:
-        moments, gradients = of_features
-        return steps, _move_features(rows[-1], moments, gradients, taught.factors)
+    """(rows and moments of each part; the features and their moments, or nothing). stops: where parts end;
+    of_features: their moments, or nothing"""
+    grad_sums, moved, moments = _move_own(rows, stops[0], packed[0], taught)
+    steps, factors = [(moved, moments)], taught.factors
+    if taught.grad_features:
+        return steps, _move_features(rows[-1], of_features, taught.grad_features, factors)
     cameras = [camera for camera, *_ in taught.views]
     for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
-        shared = taught.degree, rows[:3], cameras, grad_sums, taught.factors
-        steps.append(_move_harmonics(rows[start:stop], of_part, (start - OWN) // 3, *shared))
+        first = (start - OWN) // 3
+        steps.append(
+            _move_harmonics(rows[start:stop], of_part, first, taught.degree, rows[:3], cameras, grad_sums, factors)
+        )
     return steps, []
 
 

@@ -17,8 +17,9 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
+from spacesim.splat.train.optimizer import update as update_module
 from spacesim.splat.train.optimizer.adam import Adam
-from spacesim.splat.train.optimizer.update import FEW, Update, ViewGradients
+from spacesim.splat.train.optimizer.update import Update, ViewGradients
 from spacesim.splat.train.stages import project_views
 
 SIZE = 40, 28
@@ -123,26 +124,32 @@ def test_no_scale_gets_larger_than_it_may(surfels):
     np.testing.assert_array_equal(held[1:], np.minimum(free[1:], np.float32(bound)))
 
 
+@pytest.mark.parametrize("lit", [False, True])
 @pytest.mark.parametrize("surfels", [False, True])
-def test_parts_move_alike_at_once_and_one_by_one(surfels, monkeypatch):
-    view, found = Pinhole.of(camera(0.8)), []
-    for most in (0, 400):
-        monkeypatch.setitem(FEW, select(), most)
-        gaussians = Gaussians.from_numpy(random_splats(300))
-        weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
+def test_parts_move_alike_at_once_and_one_by_one(surfels, lit, monkeypatch):
+    view, found, rng = Pinhole.of(camera(0.8)), [], np.random.default_rng(0)
+    features, by_features = rng.normal(size=(2, 4 * 300)).astype(np.float32)
+    weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
+    for at_once in (False, True):
+        monkeypatch.setattr(update_module, "moves_at_once", lambda _, at_once=at_once: at_once)
+        drawn = Gaussians.from_numpy(random_splats(300))
+        gaussians = Gaussians.from_rows([*drawn.shape_rows(), upload(features)]) if lit else drawn
         optimizer, factors = Adam(gaussians.rows()), ad.Float([1.0, 1.0, *[0.1] * 59])
-        update = Update(False, 1.0, surfels)
+        step = Update(False, 1.0, surfels)
         for degree in (0, 2, 3, 3):
-            update(gaussians, optimizer, degree, [view_gradients(gaussians, view, weights, degree)], factors, {})
+            gradients = view_gradients(drawn, view, weights, degree)
+            gradients.grad_features = upload(by_features) if lit else None
+            step(gaussians, optimizer, degree, [gradients], factors, {})
+        assert (gaussians.features is None) != lit
         found.append([np.array(row) for row in gaussians.rows()] + optimizer.moments()[1])
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert len(np.unique(found[0][50])) > 1
+    assert all(len(np.unique(row)) > 1 for row in found[0])
 
 
 def test_a_step_of_many_holds_few_rows_twice(monkeypatch):
     """Beyond the rows and their moments, less than half as much again, where all at once would be as much again."""
-    monkeypatch.setitem(FEW, select(), 0)
+    monkeypatch.setattr(update_module, "moves_at_once", lambda _: False)
     count, view = 2**15, Pinhole.of(camera(0.8))
     arrays = random_splats(count)
     arrays["logit_opacities"][100:] = -20
