@@ -504,23 +504,26 @@ def test_where_memory_is_short_pictures_are_read_again(small_dataset, monkeypatc
 
 
 def test_recordings_serve_pictures_of_any_alignment(small_dataset):
-    trainer = Trainer(small_dataset, CONFIG)
-    load, offset = trainer.views._load, [0]
+    def recorded_in_eight_steps(later: int) -> int:
+        """Four with pictures at one alignment, four at another."""
+        trainer = Trainer(small_dataset, CONFIG)
+        load, offset, before = trainer.views._load, [0], recordings()
 
-    def at_offset(index: int) -> views.TrainingView:
-        view = load(index)
-        memory = np.empty(view.rgba.size + 32, np.uint32)
-        first = -memory.ctypes.data // 4 % 16 + offset[0]
-        memory[first : first + view.rgba.size] = view.rgba
-        return replace(view, rgba=memory[first : first + view.rgba.size])
+        def at_offset(index: int) -> views.TrainingView:
+            view = load(index)
+            memory = np.empty(view.rgba.size + 32, np.uint32)
+            first = -memory.ctypes.data // 4 % 16 + offset[0]
+            memory[first : first + view.rgba.size] = view.rgba
+            return replace(view, rgba=memory[first : first + view.rgba.size])
 
-    trainer.views._cached = at_offset
-    for _ in range(4):
-        trainer.step()
-    known, offset[0] = recordings(), 1
-    for _ in range(4):
-        trainer.step()
-    assert recordings() == known
+        trainer.views._cached = at_offset
+        for step in range(8):
+            offset[0] = later if step >= 4 else 0
+            trainer.step()
+        return recordings() - before
+
+    _, same, other = (recorded_in_eight_steps(later) for later in (0, 0, 1))  # the first makes what all share
+    assert same == other > 0
 
 
 def test_training_on_several_views_a_step_learns_and_resumes(small_dataset, tmp_path):
