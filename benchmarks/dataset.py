@@ -24,6 +24,7 @@ import numpy as np
 from support import common
 
 from spacesim import backend
+from spacesim.backend.memory import keep_freed_memory
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
@@ -51,6 +52,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     name = backend.select(options.backend)
+    keep_freed_memory()  # as the command does
     if options.frames:
         report: dict[str, Any] = {"backend": name, "memory": memory(options.scene, options.frames)}
     else:

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from spacesim.backend import BackendError
+from spacesim.backend.memory import keep_freed_memory
 from spacesim.data.errors import InputError, WorkError
 
 ALIGNMENT = 64  #: bytes, of arrays in shared memory
@@ -145,7 +146,8 @@ def end(children: Iterable[ChildProcess]) -> None:
 
 def connect_to_parent(socket: int) -> tuple[queue.SimpleQueue[Any], Callable[[Any], None]]:
     """(what the parent has sent, a function that sends it a message). Ends this process as soon as the parent
-    has gone, whatever it is doing."""
+    has gone, whatever it is doing. What it frees it keeps."""
+    keep_freed_memory()
     connection = Connection(socket)
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
 

@@ -4,6 +4,7 @@ import ctypes
 import inspect
 import mmap
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -406,6 +407,30 @@ for thread in threads:
     thread.join()
 print(found.rest.rest["three"].numpy().sum(), len(found.rest.first))
 """
+
+
+MAKES_ARRAYS = """
+import resource, sys
+import numpy as np
+from spacesim.backend.memory import keep_freed_memory
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+for turn in range(4):
+    arrays = [np.ones(3 << 20, np.uint8) for _ in range(12)]
+    del arrays
+    if turn == 1:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc alone")
+def test_freed_memory_serves_the_next_arrays():
+    def faults(how: str) -> int:
+        done = subprocess.run([sys.executable, "-c", MAKES_ARRAYS, how], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert faults("keep") < 200 < faults("give back")
 
 
 def test_recordings_do_not_wait_for_threads_that_wait_for_them():

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spacesim import backend, interrupts
+from spacesim.backend.memory import keep_freed_memory
 from spacesim.cli.parser import Parser, angles, frame_range, resolution
 from spacesim.data.errors import InputError
 
@@ -99,6 +100,7 @@ def run(options: argparse.Namespace) -> None:
     if options.out is None:
         raise InputError("out: expected a folder for the dataset, found none")
     backend.select(options.backend)
+    keep_freed_memory()
     with show_progress("generate", "frames") as report:
         if options.frames is not None:
             part = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
