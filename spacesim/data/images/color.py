@@ -9,7 +9,10 @@ Float = NDArray[np.floating]
 def srgb_from_linear(linear: ArrayLike) -> Float:
     """sRGB values of linear ones, clipped to [0, 1] first (IEC 61966-2-1). Any shape; float32 stays so."""
     x = np.clip(_as_float(linear), 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(x.dtype)
+    values = np.array(12.92 * x)
+    bright = ~(x <= 0.0031308)  # of most pictures a small part
+    values[bright] = 1.055 * x[bright] ** (1 / 2.4) - 0.055
+    return values
 
 
 def linear_from_srgb(srgb: ArrayLike) -> Float:
