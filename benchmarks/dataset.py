@@ -28,7 +28,6 @@ from spacesim.backend.memory import keep_freed_memory
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
-from spacesim.scenes import read_scene
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
@@ -36,6 +35,7 @@ from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.generation.workers import make_in_processes
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import load
+from spacesim.scenes.scenefile import read_scene
 
 WARM = 3  #: frames before the clock starts
 

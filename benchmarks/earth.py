@@ -27,8 +27,9 @@ from spacesim.eval.metrics.image import psnr
 from spacesim.learning.lights import added_light
 from spacesim.progress import show_progress
 from spacesim.reproduce.perform import trained
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.run import Run
 from spacesim.splat.train.config import METHODS, preset, with_settings
 

@@ -80,7 +80,8 @@ def data_and_run(options: argparse.Namespace) -> tuple[Dataset, Run]:
 
 
 def make_data(out: Path, seed: int = 0) -> Dataset:
-    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generation.generate import generate
+    from spacesim.scenes.scenefile import read_scene
 
     with show_progress("generate", "frames") as report:
         return generate(read_scene("boxsat", **SCENE, **TEST, seed=seed), out, resume=True, progress=report)

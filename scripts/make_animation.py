@@ -19,9 +19,9 @@ from spacesim.data.images import srgb_from_linear
 from spacesim.data.records import Camera, Sun
 from spacesim.eval.pictures import WRONGLY_LIT, WRONGLY_SHADOWED, as_bytes, shadow_picture
 from spacesim.learning.pictures import LIT, SHADOWED
-from spacesim.scenes import read_scene
 from spacesim.scenes.build import build
 from spacesim.scenes.render import Renderer
+from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.run import Run, load_run
 
 SIZE, HEADER, GAP = 512, 34, 4  #: pixels

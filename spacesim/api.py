@@ -30,9 +30,10 @@ from spacesim.learning.rendering import Rendering
 from spacesim.methods import load_predictor, load_run, load_scene, preset
 from spacesim.nerf.config import NerfConfig
 from spacesim.nerf.run import NerfRun
-from spacesim.scenes import SceneConfig, read_scene
-from spacesim.scenes import generate as _generate
 from spacesim.scenes.cameras.rig import Rig
+from spacesim.scenes.config import SceneConfig
+from spacesim.scenes.generation.generate import generate as _generate
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.spacecraft import spacecraft
 from spacesim.scenes.trajectory.rig import PoseRig
 from spacesim.serve.client import CameraClient

@@ -15,8 +15,8 @@ from spacesim.eval.evaluate import EvaluateConfig, evaluate
 from spacesim.eval.report.headings import PAGE
 from spacesim.eval.report.write import write_report
 from spacesim.progress import Reporter, report_training
-from spacesim.scenes import generate, read_scene
-from spacesim.scenes.generation.generate import versions
+from spacesim.scenes.generation.generate import generate, versions
+from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.export.html.page import write_page
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.train import train

@@ -95,7 +95,8 @@ def call(command: list[str], ended: Callable[[list[str]], Outcome] = ended) -> s
 @pytest.fixture(scope="module")
 def small_lit(tmp_path_factory) -> Path:
     """A path-traced dataset of two Suns and one never seen."""
-    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generation.generate import generate
+    from spacesim.scenes.scenefile import read_scene
 
     root = tmp_path_factory.mktemp("lit") / "data"
     generate(read_scene("boxsat", suns=2, views=2, test_suns=1, test_views=1, resolution=(24, 24), spp=4), root)
@@ -511,7 +512,8 @@ def test_strategies_tells_tables_and_goes_on_where_it_stopped(command, small_lit
 @pytest.fixture(scope="module")
 def small_pair(tmp_path_factory) -> Path:
     """Path-traced pictures of two boxsats, the first before the Sun of the second."""
-    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generation.generate import generate
+    from spacesim.scenes.scenefile import read_scene
 
     root = tmp_path_factory.mktemp("pair") / "data"
     size = {"views": 1, "test_suns": 0, "test_views": 2, "resolution": 32, "spp": 16}

@@ -165,7 +165,7 @@ def test_backfill_keeps_to_the_most_gaussians(spacesim, tiny_data, tmp_path, str
 
 def test_demo_is_importable():
     from spacesim.demo import DATA, SCENE, demo
-    from spacesim.scenes import read_scene
+    from spacesim.scenes.scenefile import read_scene
 
     assert callable(demo)
     assert read_scene(SCENE, **DATA).name == SCENE
@@ -211,7 +211,7 @@ def test_suns_are_given_by_azimuth_and_elevation(spacesim, tmp_path):
 
 
 def test_help_lists_the_built_in_scenes(spacesim):
-    from spacesim.scenes import BUILT_IN_SCENES
+    from spacesim.scenes.scenefile import BUILT_IN_SCENES
 
     shown = "".join(spacesim("generate", "--help").output.split())  # lines may break at hyphens
     assert f"({','.join(BUILT_IN_SCENES)})" in shown

@@ -20,7 +20,8 @@ from tiny import GENERATE, PROGRAM, PROGRESS, SPARING, contents, outcome
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset, write_points
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.run import load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig

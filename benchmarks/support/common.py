@@ -114,7 +114,8 @@ def run_main(main: Callable[[], None]) -> None:
 def generated(scene: str, out: Path, **options: Any) -> Path:
     """The folder of a scene's dataset, made as far as it is not there."""
     from spacesim.progress import show_progress
-    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generation.generate import generate
+    from spacesim.scenes.scenefile import read_scene
 
     with show_progress("generate", "frames") as report:
         generate(read_scene(scene, **options), out, resume=True, progress=report)

@@ -84,9 +84,8 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.progress import show_progress
-    from spacesim.scenes import generate, read_scene
-    from spacesim.scenes.generation.generate import estimate, generate_part
-    from spacesim.scenes.scenefile import scene_text
+    from spacesim.scenes.generation.generate import estimate, generate, generate_part
+    from spacesim.scenes.scenefile import read_scene, scene_text
 
     changes = {name: getattr(options, name) for name in _SCENE_OPTIONS}
     scene = read_scene(options.scene, **changes, fov_deg=options.fov)

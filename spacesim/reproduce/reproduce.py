@@ -33,10 +33,11 @@ from spacesim.reproduce.page import write_page
 from spacesim.reproduce.perform import ReportCallback, Reporting, data_folder, folder_of, is_done, perform
 from spacesim.reproduce.results import Results, Values
 from spacesim.reproduce.size import FULL, Size
-from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation.cluster import ClusterWork, join_cluster, run_on_cluster
 from spacesim.scenes.generation.estimate import duration
 from spacesim.scenes.generation.frames import versions
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 
 SCHEMA = 1  #: of reproduce.json
 MOST_SEEDS = 100

@@ -19,7 +19,7 @@ from spacesim.learning.folder import run_name
 from spacesim.serve.protocol import OUTPUTS, Output
 
 if TYPE_CHECKING:
-    from spacesim.scenes import SceneConfig
+    from spacesim.scenes.config import SceneConfig
     from spacesim.splat.run import Predictor
 
 _log = logging.getLogger(__name__)
@@ -72,8 +72,9 @@ class TracedScene:
     outputs = OUTPUTS
 
     def __init__(self, config: "SceneConfig", spp: int | None = None) -> None:
-        from spacesim.scenes import Renderer, build
         from spacesim.scenes.background.draw import Background
+        from spacesim.scenes.build import build
+        from spacesim.scenes.render import Renderer
 
         scene, self._config, self._background = build(config), config, None
         quality, lens = config.quality, config.camera.distortion
@@ -166,7 +167,7 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
     file with models). spp: samples a pixel of a scene. Raises InputError where there is none of these, and for samples
     of a run."""
     from spacesim.methods import load_run, load_scene
-    from spacesim.scenes import BUILT_IN_SCENES, read_scene
+    from spacesim.scenes.scenefile import BUILT_IN_SCENES, read_scene
 
     path = Path(what)
     is_composed = path.suffix.lower() == ".toml" and "models" in toml.read_document(path).values

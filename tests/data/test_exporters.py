@@ -19,9 +19,10 @@ from spacesim.data.files import read_json, write_json
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.records import Camera, Frame
 from spacesim.data.store import load_truth, read_dataset
-from spacesim.scenes import generate, read_scene
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.silhouette import silhouette_finder
 
 TURN = (0.8, 0.1, -0.5, 0.3)  # of the second object, not normalised

@@ -24,9 +24,9 @@ from spacesim.eval.evaluate import EvaluateConfig, evaluate, frame_names, summar
 from spacesim.eval.labels import GROUPS
 from spacesim.eval.metrics import image, lpips, shadow
 from spacesim.eval.report.write import write_report
-from spacesim.scenes import read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.sensor import SensorConfig
+from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.raster.gaussians import Gaussians
 
 SIZE = 40

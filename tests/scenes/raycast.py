@@ -15,9 +15,12 @@ from typing import Any
 import numpy as np
 
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.scenes import Renderer, Scene, build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene
+from spacesim.scenes.scenefile import read_scene
 
 NEAR_EDGE = 0.02
 """Pixels, chosen: an edge that is nearer to a pixel's centre may fall on either side of it."""

@@ -12,9 +12,12 @@ from raycast import RayCaster
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from spacesim.data.records import Camera, Sun
-from spacesim.scenes import Renderer, Scene, build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene
+from spacesim.scenes.scenefile import read_scene
 
 
 @pytest.mark.parametrize(

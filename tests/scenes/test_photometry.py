@@ -9,11 +9,15 @@ import trimesh
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_SELF_CAST
-from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft, build, read_scene, render
+from spacesim.scenes import render
+from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import Material, material
-from spacesim.scenes.spacecraft import spacecraft
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene, SceneObject
+from spacesim.scenes.scenefile import read_scene
+from spacesim.scenes.spacecraft import Part, Spacecraft, spacecraft
 
 PARALLEL = SunConfig("directional")
 

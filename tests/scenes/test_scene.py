@@ -11,9 +11,10 @@ import trimesh
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import look_at
 from spacesim.data.records import Camera, Sun
-from spacesim.scenes import Renderer, build
+from spacesim.scenes.build import build
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials.table import lambertian
+from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 

@@ -8,9 +8,10 @@ import trimesh
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
 from spacesim.data.errors import InputError
-from spacesim.scenes import build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.materials.table import SOLAR_CELL, material
 from spacesim.scenes.scene import Scene, SceneObject, box_projection
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.spacecraft import SPACECRAFT, boxsat, spacecraft
 from spacesim.scenes.spacecraft.catalogue import _make
 from spacesim.scenes.spacecraft.cubesat import SIZE

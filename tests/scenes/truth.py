@@ -20,11 +20,13 @@ import whole
 
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.scenes import Part, Renderer, Scene, SceneObject, Spacecraft
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
 from spacesim.scenes.lights.sun import SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import lambertian
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.scenefile import BUILT_IN_SCENES
+from spacesim.scenes.spacecraft import Part, Spacecraft
 
 SOLAR_RADIUS = math.asin(695_700.0 / 149_597_870.7)  # radians
 OVERHEAD = Sun.from_angles(0, 90)

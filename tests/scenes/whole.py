@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.scenes import Renderer, Scene, build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.materials import spectra
 from spacesim.scenes.materials.table import Material, customise, lambertian
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scene import Scene
+from spacesim.scenes.scenefile import read_scene
 
 EARTH = EarthConfig(azimuth_deg=200.0, elevation_deg=-40.0, altitude_km=500.0)
 

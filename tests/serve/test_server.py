@@ -50,7 +50,9 @@ def test_a_run_is_drawn_as_it_predicts(ball):
 
 
 def test_a_scene_is_path_traced_with_its_labels(traced):
-    from spacesim.scenes import Renderer, build, read_scene
+    from spacesim.scenes.build import build
+    from spacesim.scenes.render import Renderer
+    from spacesim.scenes.scenefile import read_scene
 
     config = read_scene("boxsat")
     truth = Renderer(build(config), 4, config.quality.max_depth).render(CAMERA, SUN, (config.seed, 9))

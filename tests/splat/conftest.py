@@ -94,7 +94,8 @@ def _write_dataset(root: Path, gaussians: dict[str, np.ndarray]) -> Dataset:
 @pytest.fixture(scope="session")
 def small_lit_dataset(tmp_path_factory) -> Dataset:
     """Path-traced pictures of the boxsat under two Suns, with truth."""
-    from spacesim.scenes import generate, read_scene
+    from spacesim.scenes.generation.generate import generate
+    from spacesim.scenes.scenefile import read_scene
 
     size = {"resolution": (32, 32), "spp": 8, "points": 400}
     scene = read_scene("boxsat", suns=2, views=5, test_suns=1, test_views=2, **size)

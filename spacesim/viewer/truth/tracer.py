@@ -79,7 +79,8 @@ class Tracer:
 
     def _loaded(self, scene: SceneConfig) -> "Renderer":
         if self._renderer is None or scene != self._scene:
-            from spacesim.scenes import Renderer, build
+            from spacesim.scenes.build import build
+            from spacesim.scenes.render import Renderer
 
             self._renderer = None
             self._renderer = Renderer(build(scene), PASS, scene.quality.max_depth)

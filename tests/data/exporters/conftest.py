@@ -6,8 +6,8 @@ import pytest
 
 from spacesim.data.records import Dataset
 from spacesim.data.store import read_dataset
-from spacesim.scenes import generate
 from spacesim.scenes.config import ObjectConfig, SceneConfig, with_options
+from spacesim.scenes.generation.generate import generate
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)
 

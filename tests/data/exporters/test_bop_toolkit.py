@@ -15,8 +15,8 @@ from spacesim.data.exporters.bop import _write_models
 from spacesim.data.exporters.keypoints import BodyLabels
 from spacesim.data.exporters.symmetries import find_symmetries
 from spacesim.data.images import read_png
-from spacesim.scenes import generate
 from spacesim.scenes.config import with_options
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.silhouette import silhouette_finder
 
 WHY = "bop_toolkit_lib is not installed"

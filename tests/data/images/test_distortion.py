@@ -10,10 +10,13 @@ from spacesim.data.geometry import look_at
 from spacesim.data.images import Undistortion, distort_points, load_image, undistort_points
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import load_truth, read_dataset
-from spacesim.scenes import Renderer, build, generate, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.sphere_rigs import FibonacciRig
 from spacesim.scenes.config import ObjectConfig, QualityConfig
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scenefile import read_scene
 
 BARREL = (-0.35, 0.12, 0.004, -0.003, 0.0)
 LENSES = [BARREL, (0.25, 0.0, 0.0, 0.0, 0.0), (-0.3, 0.1, -0.004, 0.002, -0.02)]

@@ -19,7 +19,8 @@ from spacesim.data.importers import speedplus
 from spacesim.data.importers.kinds import import_dataset
 from spacesim.data.importers.speedplus import import_speedplus
 from spacesim.data.store import find_unreadable_files, read_dataset
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 
 SIZE = (48, 30)
 

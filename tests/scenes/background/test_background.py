@@ -17,16 +17,17 @@ from spacesim.data.images import load_image, read_exr, read_png
 from spacesim.data.images.tone import as_bytes, display_values
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset
-from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.background import globe as globe_module
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.background.globe import Globe, Placement, albedo
 from spacesim.scenes.background.stars import FAINTEST, Stars, stars_brighter_than
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.cameras.sensor import SensorConfig
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.lights.earth import EarthConfig
-from spacesim.scenes.scenefile import scene_text
+from spacesim.scenes.scenefile import read_scene, scene_text
 from spacesim.scenes.steps import completed
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 20), "spp": 4, "points": 50}

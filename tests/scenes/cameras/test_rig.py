@@ -5,7 +5,7 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, normalize
-from spacesim.scenes import build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.orbit import mean_motion
 from spacesim.scenes.cameras.path_rigs import ApproachRig, FlyAroundRig
@@ -23,6 +23,7 @@ from spacesim.scenes.cameras.sphere_rigs import FibonacciRig, PolarArcRig, Rando
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.rigs import RIGS
+from spacesim.scenes.scenefile import read_scene
 
 ARRANGED = [kind for kind, rig in RIGS.items() if issubclass(rig, RigConfig)]
 SCENE = build(read_scene("boxsat"))

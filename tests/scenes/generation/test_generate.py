@@ -15,11 +15,12 @@ from tiny import contents
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.lock import lock_folder
 from spacesim.data.store import FrameWriter, find_unreadable_files, load_depth, load_truth, read_points
-from spacesim.scenes import build, generate, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.cameras.sphere_rigs import RandomRig
-from spacesim.scenes.generation.generate import _DatasetPlan, estimate, generate_part
+from spacesim.scenes.generation.generate import _DatasetPlan, estimate, generate, generate_part
 from spacesim.scenes.generation.lighting import is_sunlit
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.trajectory.rig import PoseRig
 
 SMALL = {"views": 4, "test_views": 2, "resolution": (24, 24), "spp": 4, "points": 300}
@@ -129,7 +130,8 @@ def test_killed_run_is_completed(tmp_path):
     config = boxsat(views=16, test_views=0)
     root = tmp_path / "killed"
     code = (
-        "from pathlib import Path; import sys; from spacesim.scenes import generate, read_scene;"
+        "from pathlib import Path; import sys; from spacesim.scenes.scenefile import read_scene;"
+        "from spacesim.scenes.generation.generate import generate;"
         f"generate(read_scene('boxsat', **{ {**SMALL, 'views': 16, 'test_views': 0}!r}), Path(sys.argv[1]), True)"
     )
     for frames in (2, 6):

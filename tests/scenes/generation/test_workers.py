@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections import deque
@@ -16,11 +17,11 @@ from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
-from spacesim.scenes import generate, read_scene
 from spacesim.scenes.generation import frames, workers
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writing_threads
-from spacesim.scenes.generation.generate import _DatasetPlan
+from spacesim.scenes.generation.generate import _DatasetPlan, generate
 from spacesim.scenes.generation.workers import make_in_processes
+from spacesim.scenes.scenefile import read_scene
 
 OPTIONS = {"views": 30, "test_views": 0, "resolution": (24, 24), "spp": 4, "points": 100}
 CONFIG = read_scene("boxsat", **OPTIONS)
@@ -88,7 +89,8 @@ def test_processes_end_with_their_parent_and_resume_completes(whole, tmp_path, m
     """kill -9 leaves no orphans; Ctrl-C leaves no half-written file either."""
     root = tmp_path / "data"
     code = (
-        "import sys; from pathlib import Path; from spacesim.scenes import generate, read_scene;"
+        "import sys; from pathlib import Path; from spacesim.scenes.scenefile import read_scene;"
+        "from spacesim.scenes.generation.generate import generate;"
         "from spacesim.scenes.generation import frames; frames.PROCESSES_FROM = {'cuda': 0, 'llvm': 0};"
         "frames.cores = lambda: 4;"
         f"generate(read_scene('boxsat', **{OPTIONS!r}), Path(sys.argv[1]), True, workers={1 + (module == 'workers')})"
@@ -290,3 +292,10 @@ def test_processes_that_have_nothing_left_to_do(tmp_path):
     (root / "transforms.json").unlink()
     generate(config, root, resume=True, workers=2)
     assert contents(root) == first
+
+
+def test_encoders_start_without_what_renders():
+    """There is one for each core of a machine."""
+    code = "import sys; import spacesim.scenes.generation.encoders; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"drjit", "mitsuba", "trimesh", "scipy"} & set(done.stdout.split())

@@ -11,10 +11,13 @@ from spacesim.data.geometry import normalize
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import load_truth
 from spacesim.data.transforms import read_dataset
-from spacesim.scenes import Renderer, build, generate, read_scene
+from spacesim.scenes.build import build
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
 from spacesim.scenes.lights.eclipse import visible_fraction
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scenefile import read_scene
 
 SUN_RADIUS = SunConfig().angular_radius
 DISTANCE = 6_878_137.0

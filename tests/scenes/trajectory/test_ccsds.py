@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.scenes import build, read_scene
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import TargetSphere, plan
 from spacesim.scenes.generation.generate import plan_views
-from spacesim.scenes.scenefile import scene_text
+from spacesim.scenes.scenefile import read_scene, scene_text
 from spacesim.scenes.trajectory.ccsds import motion_of, read_message
 from spacesim.scenes.trajectory.ephemeris import J2000_FRAMES, sun_direction
 from spacesim.scenes.trajectory.epochs import read_epochs

@@ -13,15 +13,16 @@ from spacesim.data.errors import InputError
 from spacesim.data.images import read_png
 from spacesim.data.store import load_truth
 from spacesim.data.transforms import read_dataset
-from spacesim.scenes import build, generate, read_scene
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
 from spacesim.scenes.background.stars import Stars
+from spacesim.scenes.build import build
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
 from spacesim.scenes.cameras.rig import TargetSphere, plan
-from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.generation.generate import generate, plan_views
 from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.trajectory.motion import Motion, merge
 from spacesim.scenes.trajectory.rig import FileRig
 from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track

@@ -16,7 +16,8 @@ from spacesim.data.exporters.labels import VISIBLE, DatasetLabeller
 from spacesim.data.images import read_png
 from spacesim.data.store import load_truth
 from spacesim.eval.evaluate import evaluate
-from spacesim.scenes import generate, read_scene
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.silhouette import silhouette_finder
 
 SMALL = {"resolution": (40, 32), "spp": 1, "points": 50, "test_spp": 1}

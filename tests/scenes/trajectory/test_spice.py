@@ -8,9 +8,10 @@ import pytest
 
 from spacesim.data.errors import InputError
 from spacesim.data.transforms import read_dataset
-from spacesim.scenes import generate, read_scene
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.rig import TargetSphere, plan
+from spacesim.scenes.generation.generate import generate
+from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.trajectory.spice import SpiceRig
 
 spice = pytest.importorskip("spiceypy", reason="spiceypy is not installed")

@@ -14,9 +14,12 @@ from spacesim.data.images import linear_from_srgb, read_png
 from spacesim.data.records import Dataset, Sun
 from spacesim.data.store import load_truth
 from spacesim.learning.lights import added_light
-from spacesim.scenes import Renderer, build, generate, read_scene
+from spacesim.scenes.build import build
+from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import SunConfig
+from spacesim.scenes.render import Renderer
+from spacesim.scenes.scenefile import read_scene
 from spacesim.serve.draw import load_served
 from spacesim.splat.compose.aligned import AlignedRun, moved_frame
 from spacesim.splat.compose.plain import bake_scene
