@@ -517,7 +517,7 @@ SMALL_BLOCKS = {  # in the Python of a document: what takes the place of what
     "README.md": SMALL_FACE,
     "index.md": SMALL_FACE,
     "how-to/closed-loop.md": {"128, 128": "32, 32"},
-    "how-to/gradients.md": {"640, 480": "32, 24", "2000": "50"},
+    "how-to/gradients.md": {"640, 480": "32, 24", "2000": "50", "280, 210, 80, 60": "8, 6, 16, 12"},
     "how-to/rigs.md": {"resolution=64": "resolution=16, spp=1"},
     "tutorials/first-model.md": {"256, 256": "24, 24"},
     "tutorials/torch.md": {"96, 400, 100": "24, 50, 3"},

@@ -101,7 +101,7 @@ class WayBack:
     def input_matrix(self) -> TensorXf:
         """Of the first layer, as far as gradients of the items want it."""
         rows, columns = self.shape.sizes[0]
-        wanted = columns if self.wanted is None else max(self.wanted, 1)
+        wanted = columns if self.wanted is None else self.wanted
         if -(-wanted // TILE) == -(-columns // TILE):
             return self.tape.input_layer.matrix
         wanted = round_up_rows(wanted)

@@ -84,7 +84,7 @@ class FieldConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check_ranges(self, features=(0, MAX_FEATURES), width=(1, MAX_WIDTH), layers=(1, MAX_LAYERS))
+        check_ranges(self, features=(1, MAX_FEATURES), width=(1, MAX_WIDTH), layers=(1, MAX_LAYERS))
         check_ranges(self, embeddings=(0, MAX_FEATURES))
 
     @property

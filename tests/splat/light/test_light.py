@@ -587,6 +587,12 @@ def test_features_of_another_shape_are_refused(features):
         Gaussians.from_numpy({**arrays, "features": features})
 
 
+def test_a_field_without_features_is_refused():
+    """Nothing would tell its Gaussians' colours apart."""
+    with pytest.raises(InputError, match="features: expected 1 to 1024, found 0"):
+        FieldConfig(features=0)
+
+
 # ---- training ----
 
 REFINEMENT = DensificationConfig(

@@ -237,7 +237,7 @@ def test_networks_that_go_back_together_have_the_same_gradients():
 
 
 @pytest.mark.usefixtures("_ways")
-@pytest.mark.parametrize(("wanted", "found"), [(0, 4), (65, 68), (129, 132)])
+@pytest.mark.parametrize(("wanted", "found"), [(59, 60), (65, 68), (129, 132)])
 def test_gradients_of_first_items_alone_are_the_same(wanted, found):
     case = Case(MlpShape(130, 2, 3, 12, 3), CHUNK + 1)
     weights, rows, shared, grad_rows, batch = case.device()
