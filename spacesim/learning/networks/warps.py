@@ -170,18 +170,18 @@ def totals(ways: list[WayBack], parts: list[list[Part]], sums: WarpSums) -> list
     dr.eval(of_groups)
     place = dr.arange(ad.UInt32, joined.size)
     groups = [dr.gather(ad.Float, of_groups, i * joined.size + place) for i in range(GROUPS)]
-    totals, first_of_product = sum(groups[1:], groups[0]), iter(joined.starts[1:])
+    total, first_of_product = sum(groups[1:], groups[0]), iter(joined.starts[1:])
     gradients = []
     for way, of_way in zip(ways, parts, strict=True):
         starts = [part if isinstance(part, int) else next(first_of_product) for part in of_way]
-        gradients.append(_gradients(way, totals, place, starts))
+        gradients.append(_gradients(way, total, place, starts))
     dr.eval(gradients)
     return gradients
 
 
-def _gradients(way: WayBack, totals: Float, place: UInt32, starts: list[int]) -> list[Float]:
-    """Of the weights of a network, whose matrices' and biases' begin at `starts` of a row. totals: at `place` of it"""
-    shape, all_of_row = way.shape, range(way.shape.shared)
+def _gradients(way: WayBack, total: Float, place: UInt32, starts: list[int]) -> list[Float]:
+    """Of the weights of a network, whose matrices' and biases' begin at `starts` of a row. total: at `place` of it"""
+    shape = way.shape
     (width, columns), stored = shape.sizes[0], shape.rows
     outer, gradients = dr.empty(ad.Float, width * shape.shared), []
     for i, start in enumerate(starts):
@@ -191,11 +191,12 @@ def _gradients(way: WayBack, totals: Float, place: UInt32, starts: list[int]) ->
         if i == 0:  # without the columns that items fill up
             index, active = index // stored * columns + index % stored, active & (index % stored < columns)
         gradient = dr.empty(ad.Float, size)
-        dr.scatter(gradient, totals, index, active, dr.ReduceMode.NoConflicts)
+        dr.scatter(gradient, total, index, active, dr.ReduceMode.NoConflicts)
         gradients.append(gradient)
-        for k in all_of_row if i == 1 else ():
-            by_weight = totals * dr.gather(ad.Float, way.shared, ad.UInt32(k))
-            dr.scatter(outer, by_weight, index * shape.shared + k, active, dr.ReduceMode.NoConflicts)
+        if i == 1:
+            for k in range(shape.shared):
+                by_weight = total * dr.gather(ad.Float, way.shared, ad.UInt32(k))
+                dr.scatter(outer, by_weight, index * shape.shared + k, active, dr.ReduceMode.NoConflicts)
     return [outer, *gradients]
 
 
