@@ -1,4 +1,5 @@
-"""How much memory the process may still take, on the machine and on the device: asked before much of it is taken."""
+"""How much memory the process may still take, on the machine and on the device: asked before much of it is taken. And
+what becomes of memory that it frees."""
 
 import ctypes
 import os

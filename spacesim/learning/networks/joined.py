@@ -27,7 +27,7 @@ class Joined:
         place = self._all() if place is None else place
         values = ad.Float(0)
         for array, (first, size) in zip(arrays, self._parts, strict=True):
-            values += dr.gather(ad.Float, array, row * size + (place - first), _is_within(place, first, size))
+            values += dr.gather(ad.Float, array, row * size + (place - first), is_within(place, first, size))
         return values
 
     def repeat(self, numbers: Sequence[Float]) -> Float:
@@ -42,7 +42,7 @@ class Joined:
         place, arrays = self._all(), []
         for first, size in self._parts:
             array = dr.empty(ad.Float, size)
-            dr.scatter(array, row, place - first, _is_within(place, first, size), dr.ReduceMode.NoConflicts)
+            dr.scatter(array, row, place - first, is_within(place, first, size), dr.ReduceMode.NoConflicts)
             arrays.append(array)
         return arrays
 
@@ -50,5 +50,6 @@ class Joined:
         return dr.arange(ad.UInt32, self.size)
 
 
-def _is_within(place: UInt32, first: int, size: int) -> Bool:
+def is_within(place: UInt32, first: int, size: int) -> Bool:
+    """Whether it is one of `size` places from `first` on."""
     return (place >= first) & (place < first + size)

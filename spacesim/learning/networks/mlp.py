@@ -18,6 +18,7 @@ from spacesim.learning.networks.network import (
     columns_of,
     product,
     round_up_rows,
+    row_of,
 )
 
 
@@ -63,7 +64,7 @@ def forward(
             value += first_layer.values
         if not is_last:
             tape.append(dr.maximum(value, 0))
-    return [_row(value, i) for i in range(shape.outputs)], MlpTape(tape, input_layer)
+    return [row_of(value, i) for i in range(shape.outputs)], MlpTape(tape, input_layer)
 
 
 def backward(
@@ -142,10 +143,3 @@ def _totals(way: WayBack, parts: list[Float]) -> list[Float]:
     outer = ad.TensorXf(sums[1], (rows, 1)) * ad.TensorXf(way.shared, (1, way.shape.shared))
     sums[0] = columns_of(sums[0], rows, way.shape.rows, columns, columns)
     return [outer.array, *sums]
-
-
-def _row(matrices: TensorXf, i: int) -> Float:
-    """Row i [B * m] of a TensorXf [B, C, m]."""
-    count, rows, m = matrices.shape
-    column = dr.arange(ad.UInt32, count * m)
-    return dr.gather(ad.Float, matrices.array, (column // m * rows + i) * m + column % m)

@@ -126,3 +126,10 @@ def columns_of(matrix: Float, rows: int, stored: int, row_count: int, count: int
     place = dr.arange(ad.UInt32, rows * row_count)
     row, column = place // row_count, place % row_count
     return dr.gather(ad.Float, matrix, row * stored + column, column < count)
+
+
+def row_of(matrices: TensorXf, i: int) -> Float:
+    """Row i [B * m] of a TensorXf [B, C, m]."""
+    count, rows, m = matrices.shape
+    column = dr.arange(ad.UInt32, count * m)
+    return dr.gather(ad.Float, matrices.array, (column // m * rows + i) * m + column % m)

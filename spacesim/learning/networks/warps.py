@@ -4,7 +4,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array4f, Bool, Float, TensorXf, UInt32
-from spacesim.learning.networks.joined import Joined
+from spacesim.learning.networks.joined import Joined, is_within
 from spacesim.learning.networks.network import MlpShape, WayBack, product
 
 WARP = 32  #: threads that sum up together
@@ -187,7 +187,7 @@ def _gradients(way: WayBack, total: Float, place: UInt32, starts: list[int]) -> 
     for i, start in enumerate(starts):
         rows, count = shape.sizes[i // 2]
         size = rows if i % 2 else rows * count
-        index, active = place - start, (place >= start) & (place < start + (width * stored if i == 0 else size))
+        index, active = place - start, is_within(place, start, width * stored if i == 0 else size)
         if i == 0:  # without the columns that items fill up
             index, active = index // stored * columns + index % stored, active & (index % stored < columns)
         gradient = dr.empty(ad.Float, size)

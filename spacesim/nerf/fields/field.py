@@ -12,7 +12,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float, TensorXf, UInt32
 from spacesim.learning.networks import mlp, network
-from spacesim.learning.networks.network import MlpShape, round_up_rows, sigmoid
+from spacesim.learning.networks.network import MlpShape, round_up_rows, row_of, sigmoid
 from spacesim.learning.reflectance import COSINES, surface_cosines
 from spacesim.nerf.config import CHUNK, GridConfig, NerfConfig
 from spacesim.nerf.fields.hashgrid import HashGrid
@@ -63,7 +63,7 @@ class DensityField:
         """Gradients by the parameters, from those [N] by the density and by the features."""
         by_output = self._by_output(tape, by_density, by_features)
         weights, by_items = mlp.backward(self.shape, parameters[1:], tape.layers, _one(), by_output)
-        rows = [row(by_items, i) for i in range(self.grid.outputs)]
+        rows = [row_of(by_items, i) for i in range(self.grid.outputs)]
         dr.eval(rows, weights)
         return [self.grid.adjoint(tape.point, rows), *weights]
 
@@ -72,7 +72,7 @@ class DensityField:
         none = [ad.Float(0)] * (self.shape.outputs - 1)
         by_output = self._by_output(tape, dr.full(ad.Float, 1, dr.width(tape.log_density)), none)
         _, by_items = mlp.backward(self.shape, parameters[1:], tape.layers, _one(), by_output)
-        rows = [row(by_items, i) for i in range(self.grid.outputs)]
+        rows = [row_of(by_items, i) for i in range(self.grid.outputs)]
         return self.grid.slopes(parameters[0], tape.point, rows)
 
     def _by_output(self, tape: DensityTape, by_density: Float, by_features: list[Float]) -> TensorXf:
@@ -169,9 +169,9 @@ class RadianceField:
         by_raw = [gradient * c * (1 - c) for gradient, c in zip(by_color, tape.color, strict=True)]
         by_raw_matrix = to_matrix(by_raw, exact=True)
         colors, by_items = mlp.backward(self.color, parameters[self.split :], tape.layers, _one(), by_raw_matrix)
-        by_features = [row(by_items, i) for i in range(self.features)]
+        by_features = [row_of(by_items, i) for i in range(self.features)]
         if tape.normal is not None:
-            slopes = _cosines_adjoint(tape, [row(by_items, self.features + i) for i in range(COSINES)])
+            slopes = _cosines_adjoint(tape, [row_of(by_items, self.features + i) for i in range(COSINES)])
             by_features += list(slopes if by_normal is None else slopes + by_normal)
         return self.density.adjoint(parameters[: self.split], tape.density, by_density, by_features) + colors
 
@@ -196,12 +196,6 @@ def to_matrix(rows: list[Float], exact: bool = False) -> TensorXf:
         value = rows[i] if i < len(rows) else ad.Float(0)
         dr.scatter(numbers, value, _place(column, i, height), mode=dr.ReduceMode.Permute)
     return ad.TensorXf(numbers, (count // CHUNK, height, CHUNK))
-
-
-def row(matrix: TensorXf, i: int) -> Float:
-    """Row i [N] of a matrix [B, C, 512]."""
-    column = dr.arange(ad.UInt32, matrix.shape[0] * CHUNK)
-    return dr.gather(ad.Float, matrix.array, _place(column, i, matrix.shape[1]))
 
 
 def _place(column: UInt32, i: int, height: int) -> UInt32:

@@ -9,7 +9,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, TensorXf
 from spacesim.data.errors import check_ranges
 from spacesim.data.structure import check_fields
-from spacesim.learning.networks.network import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, sigmoid
+from spacesim.learning.networks.network import MAX_FEATURES, MAX_LAYERS, MAX_WIDTH, MlpShape, row_of, sigmoid
 from spacesim.learning.reflectance import COSINES, points_away, seen_side_normals, surface_cosines
 from spacesim.splat.light.earthlight import earth_irradiance
 from spacesim.splat.light.encoding import Encoding
@@ -173,7 +173,7 @@ def normals_adjoint(
     direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
     cosines = surface_cosines(normals, direction, inputs.sun)
     first = config.features + config.view.size
-    along = sum((cosine * batch.row(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
+    along = sum((cosine * row_of(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
     for gradient in grad_facing:
         along += gradient * _faces(cosines[0], inputs, batch)
     for gradient, beams in zip(grad_earth, inputs.beams, strict=True):
@@ -201,7 +201,7 @@ def sun_adjoint(
         cosines = surface_cosines(_normals(config, inputs, batch), direction, sun)
         first = config.features + config.view.size
         for i, cosine in enumerate(cosines):
-            along += dr.sum(cosine * batch.row(grad_items, first + i))
+            along += dr.sum(cosine * row_of(grad_items, first + i))
         facing = replace(inputs, sun=sun)
         for gradient in grad_facing:
             along += dr.sum(gradient * _faces(cosines[0], facing, batch))

@@ -45,8 +45,7 @@ class PaddedBatch:
 
     def pad_zeros(self, row: Float) -> Float:
         """[N] to [M], 0 beyond N."""
-        column = self._column()
-        return dr.gather(ad.Float, row, column, column < self.count)
+        return dr.gather(ad.Float, row, self._column(), self.is_real())
 
     def block(self, packed: Float, first: int, rows: int) -> list[Float]:
         """Some rows of a packed array [C * N], [M] each."""
@@ -62,10 +61,6 @@ class PaddedBatch:
             row = rows[i] if i < len(rows) else ad.Float(0)
             dr.scatter(numbers, row, self._matrix_index(self._column(), i, height), mode=dr.ReduceMode.Permute)
         return ad.TensorXf(numbers, (self.capacity // CHUNK, height, CHUNK))
-
-    def row(self, columns: TensorXf, i: int) -> Float:
-        """Row i [M] of a TensorXf [B, C, m]."""
-        return dr.gather(ad.Float, columns.array, self._matrix_index(self._column(), i, columns.shape[1]))
 
     def unpad(self, rows: list[Float], like: Float) -> list[Float]:
         """Rows [M], evaluated, to [N]. like: any array [N]."""

@@ -179,7 +179,7 @@ def test_rows_come_back_from_matrices(count):
     assert one.shape == (batch.capacity // CHUNK, 8, CHUNK)
     np.testing.assert_array_equal(columns(one, count)[:3], packed[1:4])
     np.testing.assert_array_equal(columns(one, count)[3:], np.repeat([[2.0], [0], [0], [0], [0]], count, axis=1))
-    rows = [batch.row(one, i) for i in (2, 0)]
+    rows = [network.row_of(one, i) for i in (2, 0)]
     dr.eval(rows)
     for row, i in zip(batch.unpad(rows, like), (3, 1), strict=True):
         np.testing.assert_array_equal(numbers(row), packed[i])
