@@ -13,7 +13,9 @@ has been whole, and what is missing is damage.
 
 import logging
 import math
-from collections.abc import Mapping
+import os
+import re
+from collections.abc import Container, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -36,6 +38,7 @@ MAX_DEPTH_UNIT = 1e30  #: metres a step
 FARTHEST = 1e9  #: metres from the origin at which a camera may be: nothing is drawn beyond
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
+_UNTIDY = re.compile(r"(^|/)(\.?/|\.?$)")  # paths that have parts without a meaning
 
 Json = Mapping[str, JsonValue]
 _log = logging.getLogger(__name__)
@@ -53,7 +56,7 @@ def read_dataset(path: str | Path) -> Dataset:
     source = root / "transforms.json" if path.is_dir() else path
     if source.is_file() and source.name != "transforms_train.json":
         return dataset_of(source, read_object(source))
-    if _exists(path) and (root / "transforms_train.json").is_file():
+    if os.path.exists(path) and (root / "transforms_train.json").is_file():
         return dataset_of_pair(root, *read_pair(root))
     raise InputError(_say_what_is_missing(path, root))
 
@@ -202,7 +205,7 @@ def _read_frames(source: Path, meta: Json, needed: bool = True) -> tuple[tuple[F
     for (first, _), (second, _) in pairwise(named):
         if first == second:
             raise InputError(f"{source}: expected each image once, found {first} twice")
-    there = {path for path, _ in named if _exists(source.parent / path)}
+    there = {path for path, _ in named if os.path.exists(os.path.join(source.parent, path))}
     missing = tuple(path for path, _ in named if path not in there)
     if missing and ((needed and not there) or (source.parent / DIGESTS).is_file()):
         others = "" if there else ", nor one of any other frame"
@@ -220,7 +223,8 @@ def image_path(source: Path, entry: Json) -> str:
     file_path = _path(source, entry, "file_path")
     if file_path is None:
         raise InputError(f"{source}: expected file_path in every frame, found a frame without")
-    if not is_file(source.parent / file_path) and is_file(source.parent / f"{file_path}.png"):
+    image = os.path.join(source.parent, file_path)
+    if not os.path.isfile(image) and os.path.isfile(f"{image}.png"):
         file_path += ".png"  # Blender's files leave the suffix out
     return file_path
 
@@ -229,7 +233,7 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     image = source.parent / file_path
     values = _without_nulls({**meta, **entry})
     try:
-        if not is_file(image):
+        if not os.path.isfile(image):
             raise InputError("expected an image file, found something else")
         camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
         time = _number(entry, "time") if entry.get("time") is not None else None
@@ -370,7 +374,7 @@ def _split(
     source: Path, meta: Json, frames: tuple[Frame, ...], missing: tuple[str, ...]
 ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
     """(train, test) of `frames` by the rules above. missing: paths of frames that are left out"""
-    paths = [frame.file_path for frame in frames]
+    paths = dict.fromkeys(frame.file_path for frame in frames)
     lists = {key: meta.get(f"{key}_filenames") for key in _SPLITS}
     listed = {key: _listed(source, names, paths, missing) for key, names in lists.items() if names is not None}
     folders = {key: {path for path in paths if key in PurePosixPath(path).parts[:-1]} for key in _SPLITS}
@@ -381,7 +385,7 @@ def _split(
     elif folders["train"] and (folders["test"] or folders["val"]):
         train, test = folders["train"], folders["test"] or folders["val"]
     else:
-        test = set(paths[::_HOLD_OUT]) if len(paths) > 1 else set()
+        test = set(list(paths)[::_HOLD_OUT]) if len(paths) > 1 else set()
         train = set(paths) - test
     if train & test:
         both = min(train & test)
@@ -389,7 +393,7 @@ def _split(
     return tuple(f for f in frames if f.file_path in train), tuple(f for f in frames if f.file_path in test)
 
 
-def _listed(source: Path, names: object, paths: list[str], missing: tuple[str, ...]) -> set[str]:
+def _listed(source: Path, names: object, paths: Container[str], missing: tuple[str, ...]) -> set[str]:
     """The file paths of a list such as `train_filenames`, each of which must be one of a frame, without those that are
     missing."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -400,21 +404,6 @@ def _listed(source: Path, names: object, paths: list[str], missing: tuple[str, .
     if unknown:
         raise InputError(f"{source}: expected a frame for each name in its lists, found none for {unknown[0]}")
     return set(listed.values())
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
-
-
-def is_file(path: Path) -> bool:
-    """There is a file of this name, which may be one that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name that is too long, or has a null in it
-        return False
 
 
 def _without_nulls(values: Json) -> dict[str, JsonValue]:
@@ -443,6 +432,6 @@ def _path(source: Path, values: Json, key: str) -> str | None:
 
 def _relative(source: Path, name: str) -> str:
     """`name` of a file, from the folder of `source`, in which Windows may have put backslashes."""
-    if "\\" in name and not is_file(source.parent / name):
+    if "\\" in name and not os.path.isfile(source.parent / name):
         name = name.replace("\\", "/")
-    return str(PurePosixPath(name))
+    return str(PurePosixPath(name)) if _UNTIDY.search(name) else name

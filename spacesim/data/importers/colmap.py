@@ -1,6 +1,7 @@
 """COLMAP projects as datasets: a sparse model and its pictures."""
 
 import logging
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +22,6 @@ from spacesim.data.importers.masks import AUTO, WatchedMasks, mask_options
 from spacesim.data.importers.pictures import FrameImporter, SourceView, fitted
 from spacesim.data.importers.writing import Progress, StageProgress, frame_names, write_dataset
 from spacesim.data.records import Dataset
-from spacesim.data.transforms import is_file
 
 _FOLDERS = "images", "images_2", "images_4", "images_8"  # of a project; the others hold fractions of the size
 _WILD = 100.0  # times as far out as 95 % of points and cameras: points beyond are taken for wrong matches
@@ -128,7 +128,7 @@ def _find_pictures(
         else [p for project in projects for p in (*(project / name for name in _FOLDERS), project)]
     )
     for place in places:
-        paths = {image.name: place / image.name for image in images if is_file(place / image.name)}
+        paths = {image.name: place / image.name for image in images if os.path.isfile(place / image.name)}
         if paths:
             break
     else:
