@@ -28,6 +28,7 @@ from spacesim.backend.memory import keep_freed_memory
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import OPENCV_FROM_MITSUBA
 from spacesim.data.records import Camera
+from spacesim.data.store import WrittenFrame
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.kernel_camera import Units
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
@@ -101,9 +102,9 @@ def speed(scene: str, size: int, spp: int, views: int, workers: list[int]) -> di
     for count in workers:
         with tempfile.TemporaryDirectory() as folder:
             job = replace(job, root=Path(folder))
-            names = FrameMaker(job, renderer).make(shots) if count == 1 else make_in_processes(job, shots, count)
+            made = FrameMaker(job, renderer).make(shots) if count == 1 else make_in_processes(job, shots, count)
             key = "written" if count == 1 else f"written, {count} processes"
-            mean[key] = milliseconds_a_frame(names, WARM if count == 1 else 4 * count)
+            mean[key] = milliseconds_a_frame(made, WARM if count == 1 else 4 * count)
     written = min(value for key, value in mean.items() if key.startswith("written"))
     return {
         "milliseconds": mean,
@@ -132,9 +133,9 @@ def milliseconds(work: Any) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-def milliseconds_a_frame(names: Iterator[str], skipped: int) -> float:
+def milliseconds_a_frame(frames: Iterator[WrittenFrame], skipped: int) -> float:
     """Of frames as they come, without the first ones."""
-    moments = [time.perf_counter() for _ in names]
+    moments = [time.perf_counter() for _ in frames]
     if len(moments) <= skipped + 1:
         raise InputError(f"--views: expected at least {skipped + 2 - WARM} with so many processes")
     return 1e3 * (moments[-1] - moments[skipped]) / (len(moments) - 1 - skipped)

@@ -12,8 +12,8 @@ from PIL import Image, ImageDraw
 from spacesim.data.geometry import Array, angles_from_direction, direction_from_angles, fibonacci_sphere
 from spacesim.data.images import write_png
 from spacesim.data.images.sheet import font
+from spacesim.data.mesh import read_points
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.store import read_points
 
 BANDWIDTH_DEG = 5.0
 """Angle over which each camera is spread in the density."""

@@ -1,4 +1,4 @@
-"""Meshes as vertices and faces, and the signed distance to one, also where it is not watertight."""
+"""Meshes as vertices and faces, point clouds, and the signed distance to a mesh, also where it is not watertight."""
 
 import base64
 import io
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
@@ -381,3 +382,28 @@ def drawable_faces(vertices: Array, faces: np.ndarray) -> np.ndarray:
     longest2 = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1, initial=0.0)
     size2 = (corners**2).sum(axis=2).max(axis=1, initial=0.0)
     return faces[np.flatnonzero((longest2 > 1e-24 * size2) & (_doubled_area(corners) > 1e-12 * longest2))]
+
+
+def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
+    """Write points [N, 3] and colors [N, 3] uint8 as binary PLY with x y z red green blue alone."""
+    points, colors = np.asarray(points, "<f4"), np.asarray(colors, np.uint8)
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise ValueError(f"points, colors: expected [N, 3] each, found {points.shape} and {colors.shape}")
+    vertices = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = points, colors
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {name}" for name in ("x", "y", "z")]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode() + vertices.tobytes())
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(points [N, 3] float64, colors [N, 3] uint8) of an ascii or binary PLY file; grey 128 without colours.
+
+    Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite or
+    beyond 1e9 m.
+    """
+    cloud = load_mesh(path, ".ply")
+    check_points(cloud.vertices, path)
+    grey = np.full(cloud.vertices.shape, 128, np.uint8)
+    return cloud.vertices, grey if cloud.colors is None else cloud.colors

@@ -8,14 +8,15 @@ Reading any such folder is `spacesim.data.transforms`; this module re-exports `r
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import (
@@ -28,10 +29,10 @@ from spacesim.data.files import (
     write_bytes,
     write_json,
 )
-from spacesim.data.images import Undistortion, load_image, read_exr, read_png, write_exr, write_png
-from spacesim.data.integrity.manifest import check_manifest, read_manifest, write_manifest
+from spacesim.data.images import Undistortion, exr_bytes, load_image, png_bytes, read_exr, read_png
+from spacesim.data.integrity.manifest import check_manifest, digest_of, read_manifest, write_manifest
 from spacesim.data.integrity.whole import is_whole
-from spacesim.data.mesh import check_points, load_mesh
+from spacesim.data.mesh import read_points, write_points
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth, check_frame
 from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
@@ -45,11 +46,13 @@ __all__ = [
     "SHADOW_SELF_CAST",
     "DatasetWriter",
     "FrameWriter",
+    "WrittenFrame",
     "find_unreadable_files",
     "load_depth",
     "load_truth",
     "read_dataset",
     "read_points",
+    "sunlit_share",
     "write_points",
 ]
 
@@ -130,6 +133,22 @@ def choose_depth_unit(farthest: float) -> float:
     return factor * decade / 1000
 
 
+def sunlit_share(shadow: np.ndarray) -> tuple[float, int]:
+    """(fraction of the object's pixels in sunlight, 0 of none; number of its pixels), of shadow classes [H, W]."""
+    counts = np.bincount(shadow.ravel(), minlength=256)
+    seen = int(counts.sum() - counts[SHADOW_NONE])
+    return int(counts[SHADOW_LIT]) / max(seen, 1), seen
+
+
+@dataclass(frozen=True)
+class WrittenFrame:
+    """A frame whose files are on the disk."""
+
+    name: str  #: e.g. "train_00012"
+    digests: tuple[str, ...]  #: SHA-256 of its files
+    sunlit: float | None  #: fraction of its object's pixels that the Sun lights, None where it shows no object
+
+
 class FrameWriter:
     """Writes the frames of a dataset folder that exists; any number of processes and machines may do so at once.
 
@@ -153,7 +172,7 @@ class FrameWriter:
         paths = [f"{folder}/{name}{suffix}" for folder, suffix in _FILES.items()]
         return paths + [f"raw/{name}{suffix}.png" for suffix in self.raw]
 
-    def write_frame(self, name: str, truth: Truth, image: np.ndarray, raw: np.ndarray | None = None) -> None:
+    def write_frame(self, name: str, truth: Truth, image: np.ndarray, raw: np.ndarray | None = None) -> WrittenFrame:
         """Write the files of frame `name`, e.g. "train_00012".
 
         image: the picture, uint8 [H, W], [H, W, 3] or [H, W, 4]; raw: a sensor's digital numbers, uint16 [H, W], or
@@ -161,20 +180,33 @@ class FrameWriter:
         """
         surface = truth.object_id > 0
         pictures = {
-            f"images/{name}": image,
-            f"shadow/{name}": truth.shadow,
-            f"silhouette/{name}": np.where(surface, 255, 0).astype(np.uint8),
-            f"id/{name}": truth.object_id.astype(np.uint8),
-            f"depth/{name}": self._encode_depth(truth.depth, surface),
+            "images": image,
+            "shadow": truth.shadow,
+            "silhouette": np.where(surface, 255, 0).astype(np.uint8),
+            "id": truth.object_id.astype(np.uint8),
+            "depth": self._encode_depth(truth.depth, surface),
         }
+        contents = {f"{folder}/{name}.png": partial(png_bytes, pixels) for folder, pixels in pictures.items()}
         if raw is not None:
             planes = raw[None] if raw.ndim == 2 else raw
-            pictures |= {f"raw/{name}{suffix}": plane for suffix, plane in zip(self.raw, planes, strict=True)}
-        for path, pixels in pictures.items():
-            write_png(self.root / f"{path}.png", pixels, durable=False)
+            for suffix, plane in zip(self.raw, planes, strict=True):
+                contents[f"raw/{name}{suffix}.png"] = partial(png_bytes, plane)
         layers = {f.name: getattr(truth, f.name) for f in fields(Truth)}
         present = {key: value for key, value in layers.items() if value is not None}
-        write_exr(self.root / "gt" / f"{name}.exr", present, durable=False)
+        contents[f"gt/{name}.exr"] = partial(exr_bytes, present)
+        digests = {}
+        for path, encode in contents.items():
+            content = encode()
+            write_bytes(self.root / path, content, durable=False)
+            digests[path] = hashlib.sha256(content).hexdigest()
+        share, seen = sunlit_share(truth.shadow)
+        return WrittenFrame(name, tuple(digests[path] for path in self._files_of(name)), share if seen else None)
+
+    def read_written(self, name: str) -> WrittenFrame:
+        """What `write_frame` has returned, of a frame that is there. Raises InputError where a file cannot be read."""
+        share, seen = sunlit_share(read_png(self.root / "shadow" / f"{name}.png"))
+        digests = tuple(digest_of(self.root / path) for path in self._files_of(name))
+        return WrittenFrame(name, digests, share if seen else None)
 
     def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
         steps = np.round(np.where(surface, depth, 0).astype(np.float64) / self.depth_unit)
@@ -233,32 +265,47 @@ class DatasetWriter(FrameWriter):
         distortion: Sequence[float] = (),
         overview: Callable[[Dataset], None] | None = None,
         more: Mapping[str, Mapping[str, JsonValue]] | None = None,
+        written: Iterable[WrittenFrame] = (),
     ) -> Dataset:
         """Write points.ply, mesh.ply, SHA256SUMS and, once the disks hold everything, transforms.json; returns the
         dataset as it reads back.
 
         train, test: (frame name, camera, sun) of each frame; points: [N, 3] metres; colors: [N, 3] uint8;
         distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none; overview: writes pictures of the whole into
-        the folder; more: other keys of frames, by their names.
+        the folder; more: other keys of frames, by their names; written: of frames whose files need not be read again.
         """
-        missing = [name for name, _, _ in (*train, *test) if not self.has_frame(name)]
-        if missing:
-            raise WorkError(f"{self.root}: expected all frames to be written, {missing[0]} is not")
+        names = [name for name, _, _ in (*train, *test)]
+        digests = {
+            path: digest
+            for frame in written
+            for path, digest in zip(self._files_of(frame.name), frame.digests, strict=True)
+        }
+        self._check_all_there(names, digests)
         remove_leftovers(self.root)  # of processes that were killed
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
         path, meta = self.root / "transforms.json", _describe_frames(train, test, distortion, more or {})
         meta = {DEPTH_UNITS[0]: self.depth_unit, **meta}
         content = json_bytes(meta)
+        dataset = dataset_of(path, meta)
         if overview is not None:
-            overview(dataset_of(path, meta))
+            overview(dataset)
         parts = ["scene.json", "points.ply", "mesh.ply", *sorted(picture.name for picture in self.root.glob("*.png"))]
         parts += ["keypoints.json"] * (self.root / "keypoints.json").is_file()
-        parts += [file for name, _, _ in (*train, *test) for file in self._files_of(name)]
-        write_manifest(self.root, parts, {path.name: hashlib.sha256(content).hexdigest()})
+        parts += [file for name in names for file in self._files_of(name) if file not in digests]
+        write_manifest(self.root, parts, {**digests, path.name: hashlib.sha256(content).hexdigest()})
         flush_disks()
         write_bytes(path, content)
-        return read_dataset(self.root)
+        return dataset
+
+    def _check_all_there(self, names: Sequence[str], known: Container[str]) -> None:
+        """Raise WorkError where a file of these frames is missing, or, but for those `known` to be whole, cut off."""
+        folders = [self.root / folder for folder in (*_FILES, "raw")]
+        there = {f"{folder.name}/{file}" for folder in folders if folder.is_dir() for file in os.listdir(folder)}
+        for name in names:
+            files = self._files_of(name)
+            if not there.issuperset(files) or not (files[0] in known or self.has_frame(name)):
+                raise WorkError(f"{self.root}: expected all frames to be written, {name} is not")
 
     def _remove_damaged(self) -> None:
         """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, or, before there is
@@ -296,31 +343,6 @@ def _can_be_decoded(path: Path) -> bool:
     except InputError:
         return False
     return True
-
-
-def write_points(path: Path, points: ArrayLike, colors: ArrayLike) -> None:
-    """Write points [N, 3] and colors [N, 3] uint8 as binary PLY with x y z red green blue alone."""
-    points, colors = np.asarray(points, "<f4"), np.asarray(colors, np.uint8)
-    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
-        raise ValueError(f"points, colors: expected [N, 3] each, found {points.shape} and {colors.shape}")
-    vertices = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"], vertices["rgb"] = points, colors
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [f"property float {name}" for name in ("x", "y", "z")]
-    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    write_bytes(path, "\n".join([*header, "end_header", ""]).encode() + vertices.tobytes())
-
-
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(points [N, 3] float64, colors [N, 3] uint8) of an ascii or binary PLY file; grey 128 without colours.
-
-    Raises InputError where the file is missing, cut off, no PLY, or holds positions that are not finite or
-    beyond 1e9 m.
-    """
-    cloud = load_mesh(path, ".ply")
-    check_points(cloud.vertices, path)
-    grey = np.full(cloud.vertices.shape, 128, np.uint8)
-    return cloud.vertices, grey if cloud.colors is None else cloud.colors
 
 
 def find_unreadable_files(path: Path) -> list[str]:

@@ -20,8 +20,8 @@ from spacesim.data.density import target_of
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, read_json
 from spacesim.data.geometry import Array, quaternion_from_rotation
+from spacesim.data.mesh import read_points
 from spacesim.data.records import Camera, Dataset, Frame
-from spacesim.data.store import read_points
 from spacesim.data.transforms import read_views
 from spacesim.splat.compose.aligned import moved_frame
 from spacesim.splat.compose.pose import Pose

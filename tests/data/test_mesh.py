@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import WRITTEN, SignedDistance, _plain_ply, load_mesh, read_mesh, write_mesh
-from spacesim.data.store import write_points
+from spacesim.data.mesh import WRITTEN, SignedDistance, _plain_ply, load_mesh, read_mesh, write_mesh, write_points
 
 
 def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tiny import contents
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import load_image, read_exr, write_exr
+from spacesim.data.integrity.manifest import check_manifest, digest_of, read_manifest
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.data.store import (
     DatasetWriter,
@@ -292,6 +294,39 @@ def test_finish_needs_all_frames(tmp_path):
     with pytest.raises(WorkError, match="train_00001"):
         writer.finish(make_frames(TRAIN), [], POINTS, COLORS, trimesh.creation.box())
     assert not (tmp_path / "data/transforms.json").exists()
+
+
+def test_what_was_said_of_frames_as_they_were_written_is_what_their_files_say(root, tmp_path, monkeypatch):
+    """With a sensor's pictures too. No file of theirs is read to finish the dataset."""
+    writer = DatasetWriter(tmp_path / "again", SCENE, raw=("_r", "_g", "_b"))
+    raw = np.arange(3 * HEIGHT * WIDTH, dtype=np.uint16).reshape(3, HEIGHT, WIDTH)
+    written = [writer.write_frame(name, *make_frame(seed), raw) for seed, name in enumerate(TRAIN + TEST)]
+    assert written == [writer.read_written(name) for name in TRAIN + TEST]
+    shadow = make_truth(0).shadow
+    assert written[0].sunlit == np.mean(shadow[shadow > 0] == 255)
+    frames = make_frames(TRAIN + TEST)
+    asked: list[Path] = []
+    monkeypatch.setattr(
+        "spacesim.data.integrity.manifest.digest_of", lambda path: asked.append(path) or digest_of(path)
+    )
+    writer.finish(frames[:2], frames[2:], POINTS, COLORS, trimesh.creation.box(), written=written)
+    assert {path.name for path in asked} == {"scene.json", "points.ply", "mesh.ply"}
+    assert check_manifest(tmp_path / "again") == {}
+    listed, before = read_manifest(tmp_path / "again"), read_manifest(root)
+    assert {path: digest for path, digest in listed.items() if not path.startswith("raw/")} == before
+    assert sum(path.startswith("raw/") for path in listed) == 9
+
+
+def test_a_frame_that_is_gone_or_shows_nothing_is_said(tmp_path):
+    writer = DatasetWriter(tmp_path / "data", SCENE)
+    truth = make_truth()
+    nothing = replace(truth, object_id=np.zeros_like(truth.object_id), shadow=np.zeros_like(truth.shadow))
+    written = [writer.write_frame(name, nothing, picture_of(nothing)) for name in TRAIN]
+    assert [frame.sunlit for frame in written] == [None, None]
+    assert writer.read_written(TRAIN[0]).sunlit is None
+    (tmp_path / "data/id/train_00001.png").unlink()
+    with pytest.raises(WorkError, match="train_00001 is not"):
+        writer.finish(make_frames(TRAIN), [], POINTS, COLORS, trimesh.creation.box(), written=written)
 
 
 def test_broken_truth_is_named(root):

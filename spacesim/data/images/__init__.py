@@ -1,7 +1,7 @@
 """Pictures on disk and as numbers: PNG and EXR in and out, sRGB, lenses, and what a frame shows."""
 
 from spacesim.data.images.color import linear_from_srgb, luminance, srgb_from_linear
-from spacesim.data.images.exr import read_exr, walk_exr_header, write_exr
+from spacesim.data.images.exr import exr_bytes, read_exr, walk_exr_header, write_exr
 from spacesim.data.images.lens import Resampling, Undistortion, distort_points, undistort_points
 from spacesim.data.images.load import load_image, read_labels, resample, undistort
 from spacesim.data.images.png import has_alpha, image_size, png_bytes, read_png, write_png
@@ -10,6 +10,7 @@ __all__ = [
     "Resampling",
     "Undistortion",
     "distort_points",
+    "exr_bytes",
     "has_alpha",
     "image_size",
     "linear_from_srgb",

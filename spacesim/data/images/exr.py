@@ -26,8 +26,12 @@ _EXR_MULTIPART = 0x1000
 
 
 def write_exr(path: Path, layers: Mapping[str, np.ndarray], durable: bool = True) -> None:
-    """Write layers {name: [H, W] or [H, W, 3]} as parts of one EXR file (see above): whole or not at all (see
-    `write_bytes`)."""
+    """Write `exr_bytes` of layers: whole or not at all (see `write_bytes`)."""
+    write_bytes(path, exr_bytes(layers), durable)
+
+
+def exr_bytes(layers: Mapping[str, np.ndarray]) -> bytes:
+    """Layers {name: [H, W] or [H, W, 3]} as parts of one EXR file (see above). Raises ValueError for other arrays."""
     parts = []
     for name, layer in layers.items():
         pixels = np.asarray(layer, np.float32)
@@ -40,7 +44,7 @@ def write_exr(path: Path, layers: Mapping[str, np.ndarray], durable: bool = True
         parts.append(OpenEXR.Part(header, channels, name))
     stream = io.BytesIO()
     OpenEXR.File(parts).write(stream)
-    write_bytes(path, stream.getvalue(), durable)
+    return stream.getvalue()
 
 
 def read_exr(path: Path, size: tuple[int, int] | None = None) -> dict[str, np.ndarray]:

@@ -30,12 +30,12 @@ def digest_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def write_manifest(root: Path, paths: Iterable[str], pending: Mapping[str, str]) -> None:
-    """Write SHA256SUMS of files below `root`, by their paths from there. pending: digests of files that are not written
-    yet. Raises InputError where a file cannot be read."""
+def write_manifest(root: Path, paths: Iterable[str], known: Mapping[str, str]) -> None:
+    """Write SHA256SUMS of files below `root`, by their paths from there. known: digests of further files, which are not
+    read. Raises InputError where a file cannot be read."""
     paths = list(paths)
     with ThreadPoolExecutor(_THREADS) as pool:
-        digests = dict(zip(paths, pool.map(lambda path: digest_of(root / path), paths), strict=True)) | dict(pending)
+        digests = dict(zip(paths, pool.map(lambda path: digest_of(root / path), paths), strict=True)) | dict(known)
     lines = [f"{digest}  {path}\n" for path, digest in sorted(digests.items())]
     write_bytes(root / NAME, "".join(lines).encode())
 

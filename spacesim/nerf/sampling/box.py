@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spacesim.data.geometry import Array
-from spacesim.data.mesh import read_mesh
+from spacesim.data.mesh import read_mesh, read_points
 from spacesim.data.records import Dataset
-from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point, nearest_camera
 
 OUTLIERS = 1e-3  #: share of the points, at each end of each axis, that does not decide how large the box is

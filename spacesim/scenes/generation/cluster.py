@@ -23,6 +23,7 @@ from typing import Any
 
 from spacesim import backend
 from spacesim.data.errors import InputError, WorkError
+from spacesim.data.store import WrittenFrame
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, versions
 
 MAX_FRAMES = 16  #: of a task
@@ -85,8 +86,8 @@ def join_cluster(address: str) -> Iterator[None]:
         ray.shutdown()
 
 
-def make_on_cluster(job: Job, specs: Sequence[FrameSpec]) -> Iterator[str]:
-    """Make frames on the Ray cluster; yields the name of each once it is on the disk, in no fixed order.
+def make_on_cluster(job: Job, specs: Sequence[FrameSpec]) -> Iterator[WrittenFrame]:
+    """Make frames on the Ray cluster; yields each once it is on the disk, in no fixed order.
 
     Raises as `run_on_cluster`.
     """
@@ -95,11 +96,11 @@ def make_on_cluster(job: Job, specs: Sequence[FrameSpec]) -> Iterator[str]:
         size = max(1, min(MAX_FRAMES, len(specs) // (4 * places)))
         return (list(specs[i : i + size]) for i in range(0, len(specs), size))
 
-    for names in run_on_cluster(ClusterWork(_load_maker, job, job.root / "scene.json"), parcels):
-        yield from names
+    for frames in run_on_cluster(ClusterWork(_load_maker, job, job.root / "scene.json"), parcels):
+        yield from frames
 
 
-def _load_maker(job: Job, threads: int) -> Callable[[list[FrameSpec]], list[str]]:
+def _load_maker(job: Job, threads: int) -> Callable[[list[FrameSpec]], list[WrittenFrame]]:
     maker = FrameMaker(replace(job, threads=threads))
     return lambda specs: list(maker.make(specs))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from spacesim.data.errors import WorkError
 from spacesim.data.records import Truth
-from spacesim.data.store import FrameWriter
+from spacesim.data.store import FrameWriter, WrittenFrame
 from spacesim.processes import ATTEMPTS, ChildProcess, as_raisable, connect_to_parent, end
 from spacesim.scenes.cameras.camera import CameraConfig
 from spacesim.scenes.cameras.exposure import record_image
@@ -31,14 +31,13 @@ class FrameEncoder:
     camera: CameraConfig  #: exposure, tone and sensor
     seed: int  #: of the noise
 
-    def write(self, frame: TracedFrame) -> str:
-        """Returns the frame's name."""
+    def write(self, frame: TracedFrame) -> WrittenFrame:
+        """Returns once all its files are there."""
         truth, exposure = frame.truth, frame.exposure
         camera = self.camera if exposure is None else replace(self.camera, exposure=exposure)
         noise, behind = (self.seed, frame.index), truth.radiance_background
         recording = record_image(truth.radiance, truth.alpha, camera, noise, behind)
-        self.writer.write_frame(frame.name, truth, recording.image, recording.raw)
-        return frame.name
+        return self.writer.write_frame(frame.name, truth, recording.image, recording.raw)
 
 
 class EncoderProcesses:
@@ -49,13 +48,13 @@ class EncoderProcesses:
         self._encoder = encoder
         self._idle: queue.LifoQueue[ChildProcess] = queue.LifoQueue()  # few processes do what few can
 
-    def write(self, frame: TracedFrame) -> str:
-        """Returns the frame's name. Raises what the process raises; WorkError where several end over the frame."""
+    def write(self, frame: TracedFrame) -> WrittenFrame:
+        """Returns once all its files are there. Raises what the process raises; WorkError where several end over it."""
         for _ in range(ATTEMPTS):
             process = self._take()
             try:
                 process.lend(frame)
-                answer = process.receive()
+                answer: WrittenFrame | BaseException = process.receive()
             except (EOFError, OSError):
                 ending = process.ending()
                 continue
@@ -65,7 +64,7 @@ class EncoderProcesses:
             self._idle.put(process)
             if isinstance(answer, BaseException):
                 raise answer
-            return frame.name
+            return answer
         raise WorkError(
             f"{frame.name}: {ATTEMPTS} processes ended while they wrote it, the last {ending}; is the memory short?"
         )

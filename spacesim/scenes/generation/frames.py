@@ -16,7 +16,7 @@ import numpy as np
 from spacesim.backend import select
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera, Sun, Truth
-from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter
+from spacesim.data.store import RAW_COLOR, RAW_MONOCHROME, SHADOW_LIT, SHADOW_SELF_CAST, FrameWriter, WrittenFrame
 from spacesim.data.transforms import MILLIMETRE
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.background.draw import Background
@@ -161,7 +161,7 @@ class FrameMaker:
         quality = job.quality
         self.root = job.root
         self._job = job
-        self._has_frame = job.writer.has_frame
+        self._writer = job.writer
         self._renderer = renderer or Renderer(job.scene, quality.spp, quality.max_depth, job.camera.distortion)
         self._background = None
         if job.background is not None:
@@ -169,8 +169,8 @@ class FrameMaker:
         pixels = math.prod(job.camera.resolution)
         self._most = max(1, min(2 * job.threads, IN_FLIGHT // (BYTES_A_PIXEL * pixels)))
         self._at_once = min(AT_ONCE[select()], UNDER_WAY // pixels)
-        encoder = FrameEncoder(job.writer, job.camera, job.seed)
-        self._encode: Callable[[TracedFrame], str] = encoder.write
+        encoder = FrameEncoder(self._writer, job.camera, job.seed)
+        self._encode: Callable[[TracedFrame], WrittenFrame] = encoder.write
         self._processes: EncoderProcesses | None = None
         if job.threads > 1 and pixels >= PROCESSES_FROM[select()] and hasattr(os, "memfd_create"):
             self._processes = EncoderProcesses(encoder)
@@ -182,12 +182,12 @@ class FrameMaker:
         if self._processes is not None:
             self._processes.start(min(self._job.threads, frames))
 
-    def make(self, specs: Iterable[FrameSpec]) -> Iterator[str]:
-        """Make the frames that are not whole on disk yet; yields the name of each once it is there, in order.
+    def make(self, specs: Iterable[FrameSpec]) -> Iterator[WrittenFrame]:
+        """Make the frames that are not whole on disk yet; yields each of all once it is there, in order.
 
         The first error, of rendering or writing, ends it: what is being written then is finished first.
         """
-        waiting: deque[Future[str]] = deque()
+        waiting: deque[Future[WrittenFrame]] = deque()
         with ThreadPoolExecutor(self._job.threads, "write") as pool:
             try:
                 for spec, truth in self._rendered(specs):
@@ -216,7 +216,7 @@ class FrameMaker:
 
     def _steps(self, spec: FrameSpec) -> Steps[Truth | None]:
         """Of a frame's truth."""
-        if self._has_frame(spec.name):
+        if self._writer.has_frame(spec.name):
             return None
         seed, background = (self._job.seed, spec.index), None
         if self._background is not None:
@@ -229,7 +229,7 @@ class FrameMaker:
             return truth
         return replace(truth, radiance_background=(yield from background))
 
-    def _write(self, spec: FrameSpec, truth: Truth | None) -> str:
+    def _write(self, spec: FrameSpec, truth: Truth | None) -> WrittenFrame:
         if truth is None:
-            return spec.name
+            return self._writer.read_written(spec.name)
         return self._encode(TracedFrame(spec.name, spec.index, spec.exposure, truth))

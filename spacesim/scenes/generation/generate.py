@@ -3,6 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ from spacesim.data.geometry import Array, angles_from_direction
 from spacesim.data.integrity.manifest import digest_of
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
-from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, choose_depth_unit
+from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, WrittenFrame, choose_depth_unit
 from spacesim.data.transforms import MILLIMETRE, earth_keys
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
@@ -28,7 +29,7 @@ from spacesim.scenes.cameras.sphere_rigs import RandomRig
 from spacesim.scenes.config import QualityConfig, SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
-from spacesim.scenes.generation.lighting import is_sunlit, sunlit_fractions, warn_of_dark_frames
+from spacesim.scenes.generation.lighting import is_sunlit, warn_of_dark_frames
 from spacesim.scenes.generation.moves import cameras_inside, poses_in
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
@@ -42,7 +43,7 @@ SCHEMA = 2  #: of scene.json
 COARSE_DEPTH = 0.01  #: of the scene's size: longer steps of depth pictures are reported
 
 GenerationProgress = Callable[[int, int, str], None]
-MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[str]]  #: makes frames and yields their names
+MakeFrames = Callable[[Job, Sequence[FrameSpec]], Iterator[WrittenFrame]]  #: makes frames and yields them
 NamedViews = list[tuple[str, PlannedView]]  #: views with the names of their frames
 
 _log = logging.getLogger(__name__)
@@ -73,9 +74,12 @@ def generate(
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
             _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
-            _make_missing(writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress)
+            made = _make_missing(
+                writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress
+            )
+        written = _with_those_before(writer, sweep.specs, made)
         points, colors = sample_surface_points(sweep.renderer, config.quality.points, config.seed)
-        sunlit = sunlit_fractions(job.root, [spec.name for spec in sweep.specs])
+        sunlit = {frame.name: frame.sunlit for frame in written}
         more = {name: {**keys, "sunlit_fraction": sunlit[name]} for name, keys in sweep.keys.items()}
         dataset = writer.finish(
             _view_records(sweep.train),
@@ -86,6 +90,7 @@ def generate(
             distortion=config.camera.distortion,
             overview=lambda d: write_overview(d.root, d),
             more=more,
+            written=written,
         )
         eclipsed = {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}
         warn_of_dark_frames(sunlit, eclipsed, _against_dark_frames(config))
@@ -144,17 +149,31 @@ def _check_processes(workers: int, ray: str | None) -> None:
 def _make_missing(
     writer: FrameWriter,
     specs: Sequence[FrameSpec],
-    make: Callable[[list[FrameSpec]], Iterator[str]],
+    make: Callable[[list[FrameSpec]], Iterator[WrittenFrame]],
     progress: GenerationProgress | None,
-) -> None:
-    """Make those of the frames that are not there, and report each."""
+) -> list[WrittenFrame]:
+    """Make those of the frames that are not there, and report each; returns these."""
     missing = [spec for spec in specs if not writer.has_frame(spec.name)]
     total, complete = len(specs), len(specs) - len(missing)
     if progress is not None and complete:
         progress(complete, total, "")
-    for done, name in enumerate(make(missing), start=complete + 1):
+    made = []
+    for done, frame in enumerate(make(missing), start=complete + 1):
+        made.append(frame)
         if progress is not None:
-            progress(done, total, name)
+            progress(done, total, frame.name)
+    return made
+
+
+def _with_those_before(
+    writer: FrameWriter, specs: Sequence[FrameSpec], made: Sequence[WrittenFrame]
+) -> list[WrittenFrame]:
+    """All frames, in their order: those made now, and what the files of the others say."""
+    there = {frame.name: frame for frame in made}
+    others = [spec.name for spec in specs if spec.name not in there]
+    with ThreadPoolExecutor() as pool:
+        there |= zip(others, pool.map(writer.read_written, others), strict=True)
+    return [there[spec.name] for spec in specs]
 
 
 def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
@@ -215,7 +234,7 @@ def _frame_maker(renderer: Renderer, workers: int, ray: str | None) -> Iterator[
         yield lambda job, specs: FrameMaker(job, renderer).make(specs)
 
 
-def _make_frames(make: MakeFrames, job: Job, specs: Sequence[FrameSpec], renderer: Renderer) -> Iterator[str]:
+def _make_frames(make: MakeFrames, job: Job, specs: Sequence[FrameSpec], renderer: Renderer) -> Iterator[WrittenFrame]:
     """Frames, as they are made. A long run begins with a few, from which time and size are estimated."""
     names: set[str] = set()
     if len(specs) > LONG:
@@ -224,7 +243,7 @@ def _make_frames(make: MakeFrames, job: Job, specs: Sequence[FrameSpec], rendere
         _log.info("generate: %s", estimated)
         estimated.check(job.root)
         names = {spec.name for spec in first}
-        yield from sorted(names)
+        yield from map(job.writer.read_written, sorted(names))
     yield from make(job, [spec for spec in specs if spec.name not in names])
 
 

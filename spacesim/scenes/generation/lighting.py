@@ -2,16 +2,13 @@
 warning that counts those without."""
 
 import logging
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from spacesim.data.images import read_png
 from spacesim.data.records import Camera
-from spacesim.data.store import SHADOW_LIT, SHADOW_NONE
+from spacesim.data.store import sunlit_share
 from spacesim.scenes.generation.frames import FrameSpec, shadow_under
 from spacesim.scenes.generation.moves import as_moved
 from spacesim.scenes.render import Renderer
@@ -29,18 +26,6 @@ that picture settles on which side the frame's share is. One share in a hundred 
 _log = logging.getLogger(__name__)
 
 
-def sunlit_fractions(root: Path, names: Sequence[str]) -> dict[str, float | None]:
-    """{frame: the fraction of its object's pixels that the Sun lights, None where it shows no object}, read from
-    shadow/*.png. Raises InputError where one cannot be read."""
-
-    def fraction(name: str) -> float | None:
-        share, seen = _sunlit_share(read_png(root / "shadow" / f"{name}.png"))
-        return share if seen else None
-
-    with ThreadPoolExecutor() as pool:
-        return dict(zip(names, pool.map(fraction, names), strict=True))
-
-
 def is_sunlit(renderer: Renderer, spec: FrameSpec, least: float) -> bool:
     """Whether the Sun lights at least this fraction, above 0, of the object's pixels in a frame that is to be made: by
     the labels of a small picture, by those of larger ones as long as these leave it open, and at last by the frame's.
@@ -52,19 +37,10 @@ def is_sunlit(renderer: Renderer, spec: FrameSpec, least: float) -> bool:
     size = min(COARSE, longest)
     while True:
         labels = renderer.labels(_resized(spec.camera, size / longest), spec.sun, spec.earth)
-        share, seen = _sunlit_share(
-            shadow_under(np.float32(spec.sunlight) * labels["sun_visibility"], labels["shadow"])
-        )
+        share, seen = sunlit_share(shadow_under(np.float32(spec.sunlight) * labels["sun_visibility"], labels["shadow"]))
         if size == longest or (seen and abs(share - least) > CLEAR / seen**0.5):
             return share >= least
         size = min(2 * size, longest)
-
-
-def _sunlit_share(shadow: np.ndarray) -> tuple[float, int]:
-    """(fraction of the object's pixels in sunlight, 0 of none; number of its pixels), of shadow classes [H, W]."""
-    counts = np.bincount(shadow.ravel(), minlength=256)
-    seen = int(counts.sum() - counts[SHADOW_NONE])
-    return int(counts[SHADOW_LIT]) / max(seen, 1), seen
 
 
 def _resized(camera: Camera, factor: float) -> Camera:

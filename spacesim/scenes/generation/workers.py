@@ -18,6 +18,7 @@ from typing import Any
 from spacesim import backend
 from spacesim.data.errors import WorkError
 from spacesim.data.files import remove_leftovers
+from spacesim.data.store import WrittenFrame
 from spacesim.processes import ATTEMPTS, ChildProcess, as_raisable, connect_to_parent, end
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores, writing_threads
 
@@ -69,8 +70,8 @@ class _Worker:
             self.process.send(message)
 
 
-def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Iterator[str]:
-    """Make frames in `count` processes; yields the name of each once it is on the disk, in no fixed order.
+def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Iterator[WrittenFrame]:
+    """Make frames in `count` processes; yields each once it is on the disk, in no fixed order.
 
     Raises what a process raises, and WorkError where processes die over the same frames again and again.
     """
@@ -89,10 +90,10 @@ def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Itera
                     worker.answer(tasks)
             while tasks and len(workers) < count:
                 workers.append(_start(job, tasks.popleft(), len(workers), count))
-            for name in _receive(workers, tasks):
-                if name not in reported:
-                    reported.add(name)
-                    yield name
+            for frame in _receive(workers, tasks):
+                if frame.name not in reported:
+                    reported.add(frame.name)
+                    yield frame
     except BaseException:
         end(worker.process for worker in workers)
         if not job.shared:
@@ -102,8 +103,8 @@ def make_in_processes(job: Job, specs: Sequence[FrameSpec], count: int) -> Itera
         end(worker.process for worker in workers)
 
 
-def _receive(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[str]:
-    """Wait for messages: the name of a frame that is done, None for "what next?", or an error to raise."""
+def _receive(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[WrittenFrame]:
+    """Wait for messages: a frame that is done, None for "what next?", or an error to raise."""
     for ready in wait([worker.process.connection for worker in workers]):
         worker = next(worker for worker in workers if worker.process.connection is ready)
         try:
@@ -117,7 +118,7 @@ def _receive(workers: list[_Worker], tasks: deque[_Task]) -> Iterator[str]:
         if message is None:
             worker.answer(tasks)
         else:
-            worker.has_made(message)
+            worker.has_made(message.name)
             yield message
 
 

@@ -7,9 +7,8 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import is_near
 from spacesim.data.images import load_image
-from spacesim.data.mesh import read_mesh
+from spacesim.data.mesh import read_mesh, read_points
 from spacesim.data.records import Dataset, Frame
-from spacesim.data.store import read_points
 from spacesim.learning.cameras import focus_point, nearest_camera
 from spacesim.splat.raster.cameras import NEAR
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians

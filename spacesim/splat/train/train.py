@@ -10,8 +10,8 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.files import read_json, write_json
 from spacesim.data.images.tone import tone_and_exposure
+from spacesim.data.mesh import write_points
 from spacesim.data.records import Dataset
-from spacesim.data.store import write_points
 from spacesim.data.transforms import check_still
 from spacesim.learning.cameras import farthest_camera, focus_point
 from spacesim.learning.folder import (

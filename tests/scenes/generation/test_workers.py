@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from tiny import contents
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.records import Sun
+from spacesim.data.store import WrittenFrame
 from spacesim.scenes.generation import frames, workers
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, writing_threads
 from spacesim.scenes.generation.generate import _DatasetPlan, generate
@@ -39,6 +41,10 @@ def whole(tmp_path_factory) -> dict[str, bytes]:
 def job(tmp_path) -> tuple[Job, list[FrameSpec]]:
     sweep = _DatasetPlan(read_scene("boxsat", **{**OPTIONS, "views": 6}))
     return replace(sweep.job, root=tmp_path), sweep.specs
+
+
+def names_of(made: Iterable[WrittenFrame]) -> list[str]:
+    return [frame.name for frame in made]
 
 
 def workers_of(parent: int, module: str = "workers") -> list[int]:
@@ -148,9 +154,9 @@ def test_an_error_in_a_worker_is_raised_unchanged(job, tmp_path):
 def test_frames_that_are_whole_are_not_rendered_again(job, monkeypatch):
     work, specs = job
     maker = FrameMaker(work)
-    assert list(maker.make(specs)) == [spec.name for spec in specs]
+    assert names_of(maker.make(specs)) == [spec.name for spec in specs]
     monkeypatch.setattr(maker, "_renderer", None)
-    assert list(maker.make(specs)) == [spec.name for spec in specs]
+    assert names_of(maker.make(specs)) == [spec.name for spec in specs]
 
 
 @pytest.mark.parametrize("at_once", [0, 1, 3])
@@ -159,11 +165,11 @@ def test_frames_are_the_same_however_many_are_under_way(job, tmp_path, monkeypat
     work, specs = job
     specs = [replace(spec, sun=Sun.from_angles(70 * spec.index, 20)) for spec in specs]
     one = replace(work, root=tmp_path / "one")
-    assert list(FrameMaker(one).make(specs)) == [spec.name for spec in specs]
+    assert names_of(FrameMaker(one).make(specs)) == [spec.name for spec in specs]
     monkeypatch.setattr(frames, "AT_ONCE", dict.fromkeys(frames.AT_ONCE, at_once))
     again = FrameMaker(replace(work, root=tmp_path / "again"))
-    assert list(again.make(specs[1:3])) == [spec.name for spec in specs[1:3]]
-    assert list(again.make(specs)) == [spec.name for spec in specs]
+    assert names_of(again.make(specs[1:3])) == [spec.name for spec in specs[1:3]]
+    assert names_of(again.make(specs)) == [spec.name for spec in specs]
     assert contents(tmp_path / "again") == contents(one.root)
 
 
@@ -200,11 +206,11 @@ def test_processes_encode_the_same_bytes_and_may_die(encoding, tmp_path, monkeyp
     work, specs = encoding
     maker = FrameMaker(work)
     made = maker.make(specs)
-    names = [next(made), next(made)]
+    first = [next(made), next(made)]
     started = workers_of(os.getpid(), "encoders")
     assert len(started) == 2
     os.kill(started[0], signal.SIGKILL)
-    assert [*names, *made] == [spec.name for spec in specs]
+    assert names_of([*first, *made]) == [spec.name for spec in specs]
     assert started[0] not in workers_of(os.getpid(), "encoders")
     del maker, made
     assert not any(alive(process) for process in workers_of(os.getpid(), "encoders"))
@@ -233,16 +239,16 @@ class _Obliging:
     """A process that makes all that it is given at once, and its connection."""
 
     def __init__(self) -> None:
-        self.answers: list[str | None] = [None]
+        self.answers: list[WrittenFrame | None] = [None]
 
     @property
     def connection(self) -> "_Obliging":
         return self
 
     def send(self, specs: list[FrameSpec]) -> None:
-        self.answers += [*(spec.name for spec in specs), None]
+        self.answers += [*(WrittenFrame(spec.name, (), None) for spec in specs), None]
 
-    def receive(self) -> str | None:
+    def receive(self) -> WrittenFrame | None:
         return self.answers.pop(0)
 
 
@@ -260,7 +266,7 @@ def test_several_processes_may_ask_at_once_when_few_tasks_are_left(job, monkeypa
     monkeypatch.setattr(workers, "end", lambda _processes: None)
     monkeypatch.setattr(workers, "wait", all_that_spoke)
     work, specs = job
-    assert sorted(make_in_processes(work, specs, count)) == sorted(spec.name for spec in specs)
+    assert sorted(names_of(make_in_processes(work, specs, count))) == sorted(spec.name for spec in specs)
 
 
 def test_threads_are_shared_among_processes(monkeypatch):
