@@ -18,11 +18,12 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.readback import AsyncArray
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
+from spacesim.scenes.coverage import Coverage, is_covered
 from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene, load
@@ -69,6 +70,7 @@ class Renderer:
         integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
         sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
+        self._coverage = Coverage(scene, self._loaded.units, distortion)
         self._sums = record_on_cuda(partial(_trace_paths, integrator, sampler, self._distortion))
 
     def of(self, scene: Scene) -> "Renderer":
@@ -91,9 +93,7 @@ class Renderer:
         self._point(sun, earth)
         labelling = self._labeller.labels(camera, sun)
         next(labelling)  # read while the device traces paths
-        sunlight = self._launch_passes(self._loaded.sunlit, camera, seed, spp)
-        earthlit = self._loaded.earthlit
-        earthlight = self._launch_passes(earthlit, camera, (*seed, _EARTH), spp) if earthlit else None
+        sunlight, earthlight = self._launch(camera, seed, spp)
         yield
         labels = yield from labelling
         radiance, alpha = _mean_radiance(sunlight, camera, spp)
@@ -106,12 +106,10 @@ class Renderer:
         """(radiance [H, W, 3] from all sources, alpha [H, W]) of what `render` returns, without the labels."""
         _check_memory(camera, self.spp)
         self._point(sun)
-        radiance, alpha = _mean_radiance(
-            self._launch_passes(self._loaded.sunlit, camera, seed, self.spp), camera, self.spp
-        )
-        if self._loaded.earthlit is not None:
-            earth = self._launch_passes(self._loaded.earthlit, camera, (*seed, _EARTH), self.spp)
-            radiance = radiance + _mean_radiance(earth, camera, self.spp)[0]
+        sunlight, earthlight = self._launch(camera, seed, self.spp)
+        radiance, alpha = _mean_radiance(sunlight, camera, self.spp)
+        if earthlight is not None:
+            radiance = radiance + _mean_radiance(earthlight, camera, self.spp)[0]
         return radiance, alpha
 
     def _point(self, sun: Sun, earth: EarthConfig | None = None) -> None:
@@ -125,14 +123,25 @@ class Renderer:
         self._point(sun, earth)
         return completed(self._labeller.labels(camera, sun))
 
-    def _launch_passes(self, scene: mt.Scene, camera: Camera, seed: Sequence[int], spp: int) -> list[AsyncArray]:
+    def _launch(
+        self, camera: Camera, seed: Sequence[int], spp: int
+    ) -> tuple[list[AsyncArray], list[AsyncArray] | None]:
+        """Sums of all passes (under the Sun, by the Earth's light, None without)."""
+        view = KernelCamera.of(camera, self._loaded.units)
+        tiles, earthlit = self._coverage.tiles(view), self._loaded.earthlit
+        sunlight = self._launch_passes(self._loaded.sunlit, view, tiles, seed, spp)
+        return sunlight, self._launch_passes(earthlit, view, tiles, (*seed, _EARTH), spp) if earthlit else None
+
+    def _launch_passes(
+        self, scene: mt.Scene, view: KernelCamera, tiles: Bool, seed: Sequence[int], spp: int
+    ) -> list[AsyncArray]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
-        uint, view = backend.mitsuba().UInt32, KernelCamera.of(camera, self._loaded.units)
+        uint = backend.mitsuba().UInt32
         passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
         firsts = [spp * i // passes for i in range(passes + 1)]
         noise = [_Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])) for i in range(passes)]
-        return [AsyncArray(self._sums(scene, view, noise[i], firsts[i + 1] - firsts[i])) for i in range(passes)]
+        return [AsyncArray(self._sums(scene, view, tiles, noise[i], firsts[i + 1] - firsts[i])) for i in range(passes)]
 
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
@@ -176,10 +185,11 @@ def _trace_paths(
     distortion: Sequence[float],
     scene: mt.Scene,
     view: KernelCamera,
+    tiles: Bool,
     noise: _Noise,
     spp: int,
 ) -> Float:
-    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]."""
+    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]. tiles: where there is something to see"""
     mi = backend.mitsuba()
     samples = spp * view.width * view.height
     sampler = sampler.fork()  # a state that was there before must not be freed in a recording
@@ -188,7 +198,7 @@ def _trace_paths(
     pixel = index // spp
     offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
     ray, _ = view.rays(pixel, offset, distortion)
-    radiance, hit, _ = integrator.sample(scene, sampler, ray)
+    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=is_covered(tiles, view, pixel))
     channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
     dr.eval(channels)
     *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)

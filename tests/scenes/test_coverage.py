@@ -1,0 +1,114 @@
+"""Where a scene is not traced, there is nothing to see."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+import trimesh
+import truth
+
+from spacesim import backend
+from spacesim.data.geometry import look_at
+from spacesim.data.records import Camera, Sun
+from spacesim.scenes.cameras.kernel_camera import KernelCamera, Units
+from spacesim.scenes.coverage import Coverage, is_covered
+from spacesim.scenes.generation.generate import _DatasetPlan
+from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.scene import load
+from spacesim.scenes.scenefile import read_scene
+
+SIZE = 96
+ACROSS = 16  #: rays along a pixel's side
+
+
+def hits_and_coverage(mesh: trimesh.Trimesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] bool each: pixels through which one of many rays meets the mesh, and pixels that are covered."""
+    mi = backend.mitsuba()
+    scene = truth.scene_of(mesh)
+    units = Units.of(scene.bounding_sphere)
+    view = KernelCamera.of(camera, units)
+    loaded = load(scene).labelled
+    index = dr.arange(mi.UInt32, ACROSS**2 * camera.width * camera.height)
+    pixel, sample = index // ACROSS**2, index % ACROSS**2
+    offset = mi.Point2f(mi.Float(sample % ACROSS), mi.Float(sample // ACROSS)) / (ACROSS - 1)
+    ray, _ = view.rays(pixel, offset, ())
+    hit = dr.block_sum(dr.select(loaded.ray_test(ray), mi.Float(1), 0), ACROSS**2).numpy() > 0
+    tiles = Coverage(scene, units, ()).tiles(view)
+    covered = is_covered(tiles, view, dr.arange(mi.UInt32, camera.width * camera.height)).numpy()
+    return hit.reshape(camera.height, camera.width), covered.reshape(camera.height, camera.width)
+
+
+def soup(seed: int, count: int, size: float) -> trimesh.Trimesh:
+    """Triangles of any shape within a ball of radius 1, slivers among them."""
+    random = np.random.default_rng(seed)
+    centres = random.normal(size=(count, 1, 3))
+    centres /= np.maximum(np.linalg.norm(centres, axis=-1, keepdims=True), 1)
+    corners = centres + size * random.normal(size=(count, 3, 3)) * random.choice([1, 0.01, 1e-4], (count, 1, 1))
+    corners[::5, 2] = corners[::5, 1] + 1e-5 * random.normal(size=corners[::5, 2].shape)
+    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), process=False)
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.7, 1.5, 4.0, 400.0, 1e6])
+@pytest.mark.parametrize(("count", "size"), [(3, 2.0), (40, 0.3), (400, 0.03)])
+def test_all_that_rays_meet_is_covered(distance, count, size):
+    """From within the triangles, from beside them and from so far away that they fill a picture of a narrow view."""
+    for seed in range(12):
+        mesh = soup(seed, count, size)
+        pose = look_at(np.array([0.9, -0.3, 0.3]) * distance, [0.1, 0.2, 0.0 if distance else 1.0])
+        camera = Camera.from_fov(pose, SIZE, SIZE - 22, 2 * np.degrees(np.arctan(1.2 / max(distance, 1.2))))
+        hit, covered = hits_and_coverage(mesh, camera)
+        assert not (hit & ~covered).any()
+
+
+def test_a_triangle_that_begins_behind_the_camera_is_covered():
+    """Its corner there would be seen in the middle, its surface is seen at the right."""
+    mesh = trimesh.Trimesh([[0, -1, 0], [0.8, 5, 0.3], [0.8, 5, -0.3]], [[0, 1, 2]], process=False)
+    camera = Camera.from_fov(look_at(np.array([0.0, 0.0, 0.0]), [0.0, 1.0, 0.0]), SIZE, SIZE, 90.0)
+    hit, covered = hits_and_coverage(mesh, camera)
+    assert hit[:, -1].any()
+    assert not (hit & ~covered).any()
+
+
+def test_little_more_is_covered():
+    """Than the pixels next to the tiles that a sphere, and a thin plate across the picture, are seen in."""
+    turn = trimesh.transformations.rotation_matrix(0.6, [0, 1, 0])
+    thin = trimesh.creation.box((3.0, 0.01, 0.01), transform=turn)
+    for mesh in (trimesh.creation.icosphere(3), thin):
+        camera = Camera.from_fov(look_at(np.array([0.0, -8.0, 0.0]), [0.0, 0.0, 0.0]), SIZE, SIZE, 30.0)
+        hit, covered = hits_and_coverage(mesh, camera)
+        assert 0.005 < hit.mean() < 0.5
+        reached = np.zeros_like(hit)
+        for row, column in np.argwhere(hit):
+            reached[max(0, row - 6) : row + 7, max(0, column - 6) : column + 7] = True
+        assert not (covered & ~reached).any()
+    camera = Camera.from_fov(look_at(np.array([0.0, -8.0, 0.0]), [0.0, -16.0, 0.0]), SIZE, SIZE, 30.0)
+    hit, covered = hits_and_coverage(trimesh.creation.icosphere(3), camera)
+    assert not covered.any(), "it is behind"
+
+
+@pytest.mark.parametrize("scene", ["boxsat", "cubesat"])
+def test_pictures_are_those_of_all_pixels_to_the_bit(scene, monkeypatch):
+    config = read_scene(scene, views=3, test_views=0, resolution=(70, 50), spp=16)
+    plan = _DatasetPlan(replace(config, earth=EarthConfig(20.0, 30.0)))
+    distant = [replace(spec.camera, fx=0.1 * spec.camera.fx, fy=0.1 * spec.camera.fy) for spec in plan.specs]
+    close = [replace(spec.camera, fx=6 * spec.camera.fx, fy=6 * spec.camera.fy) for spec in plan.specs]
+    cameras = [*(spec.camera for spec in plan.specs), *distant, *close]
+    some = [plan.renderer.render(camera, Sun.from_angles(30, 20), (0, 1)) for camera in cameras]
+    shares = [plan.renderer._coverage.tiles(KernelCamera.of(camera, plan.renderer._loaded.units)) for camera in cameras]
+    assert 0 < min(float(share.numpy().mean()) for share in shares) < 0.1
+    monkeypatch.setattr("spacesim.scenes.render.is_covered", lambda _tiles, _view, _pixel: backend.mitsuba().Bool(True))
+    for camera, truth_of_some in zip(cameras, some, strict=True):
+        whole = plan.renderer.render(camera, Sun.from_angles(30, 20), (0, 1))
+        for name in ("radiance", "alpha", "radiance_earth"):
+            np.testing.assert_array_equal(getattr(whole, name), getattr(truth_of_some, name))
+
+
+def test_a_lens_that_distorts_is_traced_whole():
+    scene = truth.scene_of(trimesh.creation.icosphere(1))
+    view = KernelCamera.of(
+        Camera.from_fov(look_at(np.array([0.0, -80.0, 0.0]), [0.0, 0.0, 0.0]), 33, 21, 30.0),
+        Units.of(scene.bounding_sphere),
+    )
+    assert Coverage(scene, Units.of(scene.bounding_sphere), (0.1, 0, 0, 0, 0)).tiles(view).numpy().all()
+    assert not Coverage(scene, Units.of(scene.bounding_sphere), (0.0, 0, 0, 0, 0)).tiles(view).numpy().all()
