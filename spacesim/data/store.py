@@ -9,7 +9,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import partial
@@ -74,6 +74,7 @@ _OPTIONAL = ("radiance_earth", "radiance_background")
 _FILTERED = ("radiance", "alpha", *_OPTIONAL)
 RAW_MONOCHROME, RAW_COLOR = ("",), ("_r", "_g", "_b")  #: suffixes of the files in raw/
 DEPTH_UNIT = "depth_unit"  #: key of scene.json: metres a step of depth/*.png, where that is no millimetre
+MANY_FILES = 1000  #: of frames, whose reading is told: it takes some 5 ms each
 DEPTH_MARGIN = 1.05  #: beyond the farthest surface that coarser steps reach
 _MOST_STEPS = np.iinfo(np.uint16).max
 
@@ -146,6 +147,7 @@ class WrittenFrame:
 
     name: str  #: e.g. "train_00012"
     digests: tuple[str, ...]  #: SHA-256 of its files
+    sizes: tuple[int, ...]  #: bytes of its files
     sunlit: float | None  #: fraction of its object's pixels that the Sun lights, None where it shows no object
 
 
@@ -176,8 +178,10 @@ class FrameWriter:
         """Write the files of frame `name`, e.g. "train_00012".
 
         image: the picture, uint8 [H, W], [H, W, 3] or [H, W, 4]; raw: a sensor's digital numbers, uint16 [H, W], or
-        [3, H, W] for R, G and B, written to raw/ where given.
+        [3, H, W] for R, G and B, where the writer has suffixes of raw/, else None.
         """
+        if (raw is None) != (not self.raw):
+            raise ValueError(f"raw: expected {'numbers for raw/' if self.raw else 'none'}, found others")
         surface = truth.object_id > 0
         pictures = {
             "images": image,
@@ -194,19 +198,21 @@ class FrameWriter:
         layers = {f.name: getattr(truth, f.name) for f in fields(Truth)}
         present = {key: value for key, value in layers.items() if value is not None}
         contents[f"gt/{name}.exr"] = partial(exr_bytes, present)
-        digests = {}
+        written = {}
         for path, encode in contents.items():
             content = encode()
             write_bytes(self.root / path, content, durable=False)
-            digests[path] = hashlib.sha256(content).hexdigest()
+            written[path] = hashlib.sha256(content).hexdigest(), len(content)
+        digests, sizes = zip(*(written[path] for path in self._files_of(name)), strict=True)
         share, seen = sunlit_share(truth.shadow)
-        return WrittenFrame(name, tuple(digests[path] for path in self._files_of(name)), share if seen else None)
+        return WrittenFrame(name, digests, sizes, share if seen else None)
 
     def read_written(self, name: str) -> WrittenFrame:
         """What `write_frame` has returned, of a frame that is there. Raises InputError where a file cannot be read."""
         share, seen = sunlit_share(read_png(self.root / "shadow" / f"{name}.png"))
-        digests = tuple(digest_of(self.root / path) for path in self._files_of(name))
-        return WrittenFrame(name, digests, share if seen else None)
+        files = [self.root / path for path in self._files_of(name)]
+        sizes = tuple(path.stat().st_size for path in files)
+        return WrittenFrame(name, tuple(map(digest_of, files)), sizes, share if seen else None)
 
     def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
         steps = np.round(np.where(surface, depth, 0).astype(np.float64) / self.depth_unit)
@@ -274,13 +280,10 @@ class DatasetWriter(FrameWriter):
         distortion: Brown-Conrady k1, k2, p1, p2, k3 of all frames, () none; overview: writes pictures of the whole into
         the folder; more: other keys of frames, by their names; written: of frames whose files need not be read again.
         """
-        names = [name for name, _, _ in (*train, *test)]
-        digests = {
-            path: digest
-            for frame in written
-            for path, digest in zip(self._files_of(frame.name), frame.digests, strict=True)
-        }
-        self._check_all_there(names, digests)
+        names, known = [name for name, _, _ in (*train, *test)], {frame.name: frame for frame in written}
+        for name in names:
+            if not (self._is_there(known[name]) if name in known else self.has_frame(name)):
+                raise WorkError(f"{self.root}: expected all frames to be written, {name} is not")
         remove_leftovers(self.root)  # of processes that were killed
         write_points(self.root / "points.ply", points, colors)
         write_bytes(self.root / "mesh.ply", mesh.export(file_type="ply", vertex_normal=False))
@@ -292,20 +295,22 @@ class DatasetWriter(FrameWriter):
             overview(dataset)
         parts = ["scene.json", "points.ply", "mesh.ply", *sorted(picture.name for picture in self.root.glob("*.png"))]
         parts += ["keypoints.json"] * (self.root / "keypoints.json").is_file()
-        parts += [file for name in names for file in self._files_of(name) if file not in digests]
-        write_manifest(self.root, parts, {**digests, path.name: hashlib.sha256(content).hexdigest()})
+        parts += [file for name in names if name not in known for file in self._files_of(name)]
+        digests = {path.name: hashlib.sha256(content).hexdigest()}
+        for name in known:
+            digests |= zip(self._files_of(name), known[name].digests, strict=True)
+        write_manifest(self.root, parts, digests)
         flush_disks()
         write_bytes(path, content)
         return dataset
 
-    def _check_all_there(self, names: Sequence[str], known: Container[str]) -> None:
-        """Raise WorkError where a file of these frames is missing, or, but for those `known` to be whole, cut off."""
-        folders = [self.root / folder for folder in (*_FILES, "raw")]
-        there = {f"{folder.name}/{file}" for folder in folders if folder.is_dir() for file in os.listdir(folder)}
-        for name in names:
-            files = self._files_of(name)
-            if not there.issuperset(files) or not (files[0] in known or self.has_frame(name)):
-                raise WorkError(f"{self.root}: expected all frames to be written, {name} is not")
+    def _is_there(self, frame: WrittenFrame) -> bool:
+        """All its files are, as long as they were written."""
+        files = [os.path.join(self.root, path) for path in self._files_of(frame.name)]
+        try:
+            return tuple(map(os.path.getsize, files)) == frame.sizes
+        except OSError:
+            return False
 
     def _remove_damaged(self) -> None:
         """Take away the frames' files that are not what SHA256SUMS of the finished dataset says, or, before there is
@@ -316,12 +321,17 @@ class DatasetWriter(FrameWriter):
             damaged = [path for path in check_manifest(self.root) if path.split("/")[0] in frames]
         else:
             paths = [path for folder in frames for path in sorted((self.root / folder).glob("*.*"))]
+            if len(paths) > MANY_FILES:  # less takes no time
+                _log.info("%s: reading %d files that are there", self.root, len(paths))
             with ThreadPoolExecutor() as pool:
                 decodable = list(pool.map(_can_be_decoded, paths))
             pairs = zip(paths, decodable, strict=True)
             damaged = [str(path.relative_to(self.root)) for path, is_sound in pairs if not is_sound]
         for path in damaged:
-            (self.root / path).unlink(missing_ok=True)
+            try:
+                (self.root / path).unlink(missing_ok=True)
+            except OSError as error:  # a folder, say
+                raise InputError(f"{self.root / path}: cannot be removed ({error.strerror or error})") from None
         if damaged:
             _log.warning("%s: %d files are damaged, %s the first; made again", self.root, len(damaged), damaged[0])
 

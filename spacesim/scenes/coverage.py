@@ -5,11 +5,13 @@ and L. Ohlsson, "Conservative rasterization", GPU Gems 2, 2005).
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
+from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.arrays import Bool, Float, Int32, UInt32
 from spacesim.backend.upload import upload
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, Units, record_on_cuda
@@ -17,8 +19,9 @@ from spacesim.scenes.scene import Scene
 
 TILE = 4  #: pixels of a side
 MARGIN = 1.0  #: pixels about a triangle: far more than single precision is off
-CLOSE = 1e-3 * RADIUS  #: from the camera's plane; a triangle that comes closer may be anywhere in the picture
-FARTHEST = 1e5  #: pixels from the picture; so may one with corners beyond, which single precision places badly
+CLOSE = 1e-3 * RADIUS  #: from the camera's plane: where a triangle that comes closer is seen is not asked
+SLACK = 1e-6 * RADIUS  #: by which a triangle is beyond a plane: more than single precision is off
+FARTHEST = 1e5  #: pixels from the picture: edges of triangles with corners beyond are not asked
 
 
 class Coverage:
@@ -30,16 +33,17 @@ class Coverage:
         self._mark = record_on_cuda(_mark_tiles)
 
     def tiles(self, view: KernelCamera) -> Bool:
-        """[ceil(H / TILE) ceil(W / TILE)], row by row: where the scene may be seen."""
+        """[ceil(H / TILE) ceil(W / TILE) + 1], row by row: where the scene may be seen; at the end: all over."""
         if not self._corners:
-            return dr.opaque(backend.mitsuba().Bool, True, _across(view) * _down(view))
+            return dr.opaque(backend.mitsuba().Bool, True, _count(view) + 1)
         return self._mark(view, self._corners)
 
 
 def is_covered(tiles: Bool, view: KernelCamera, pixel: UInt32) -> Bool:
     """Whether the scene may be seen in pixels (index row by row)."""
+    bools = backend.mitsuba().Bool
     tile = pixel // view.width // TILE * _across(view) + pixel % view.width // TILE
-    return dr.gather(backend.mitsuba().Bool, tiles, tile)
+    return dr.gather(bools, tiles, tile) | dr.gather(bools, tiles, _count(view))
 
 
 def _across(view: KernelCamera) -> int:
@@ -50,22 +54,34 @@ def _down(view: KernelCamera) -> int:
     return -(-view.height // TILE)
 
 
+def _count(view: KernelCamera) -> int:
+    return _across(view) * _down(view)
+
+
 def _mark_tiles(view: KernelCamera, corners: Sequence[Float]) -> Bool:
     """The tiles that triangles reach. corners: x, y and z of each triangle's three, in Mitsuba's coordinates, [F]."""
     mi = backend.mitsuba()
-    tiles = dr.zeros(mi.Bool, _across(view) * _down(view))
-    arms = [mi.Vector3f(corners[k : k + 3]) - view.start for k in (0, 3, 6)]
-    depths = [view.near + dr.dot(arm, view.forward) for arm in arms]
+    tiles = dr.zeros(mi.Bool, _count(view) + 1)
+    sides, depths = _in_camera(view, [mi.Vector3f(corners[k : k + 3]) for k in (0, 3, 6)])
+    seen = _largest(depths) > -SLACK
+    for side, focal, centre, size in zip(sides, view.focal, view.centre, (view.width, view.height), strict=True):
+        before = [at + (centre + MARGIN) / focal * z for at, z in zip(side, depths, strict=True)]
+        after = [at - (size + MARGIN - centre) / focal * z for at, z in zip(side, depths, strict=True)]
+        seen &= (_largest(before) > -SLACK) & (_smallest(after) < SLACK)
+    is_odd = _largest([dr.abs(centre) for centre in view.centre]) > FARTHEST  # of which rays have few digits
+    seen |= is_odd
+    is_close = (_smallest(depths) < CLOSE) | is_odd
+    dr.scatter(tiles, mi.Bool(True), mi.UInt32(_count(view)), seen & is_close)
+
     scales = [1 / dr.maximum(depth, CLOSE) for depth in depths]
     x, y = (
-        [dr.dot(arm, axis) * scale * view.focal[k] + view.centre[k] for arm, scale in zip(arms, scales, strict=True)]
-        for k, axis in enumerate((view.right, view.down))
+        [at * scale * focal + centre for at, scale in zip(side, scales, strict=True)]
+        for side, focal, centre in zip(sides, view.focal, view.centre, strict=True)
     )
-    far = dr.maximum(_largest([dr.abs(value) for value in x]), _largest([dr.abs(value) for value in y]))
-    anywhere = (_smallest(depths) < CLOSE) | ~(far < FARTHEST)
-    left, width = _tile_range(x, anywhere, _across(view))
-    top, height = _tile_range(y, anywhere, _down(view))
-    count = dr.select(_largest(depths) > -CLOSE, width * height, 0)
+    is_far = ~(_largest([dr.abs(value) for value in (*x, *y)]) < FARTHEST)
+    left, width = _tile_range(x, _across(view))
+    top, height = _tile_range(y, _down(view))
+    count = dr.select(seen & ~is_close, width * height, 0)
     across = dr.maximum(width, 1)
 
     def is_outside(column: Int32, row: Int32) -> Bool:
@@ -83,7 +99,7 @@ def _mark_tiles(view: KernelCamera, corners: Sequence[Float]) -> Bool:
 
     def mark(number: Int32) -> tuple[Int32]:
         column, row = left + number % across, top + number // across
-        dr.scatter(tiles, mi.Bool(True), mi.UInt32(row * _across(view) + column), anywhere | ~is_outside(column, row))
+        dr.scatter(tiles, mi.Bool(True), mi.UInt32(row * _across(view) + column), is_far | ~is_outside(column, row))
         return (number + 1,)
 
     def has_more(number: Int32) -> Bool:
@@ -93,19 +109,30 @@ def _mark_tiles(view: KernelCamera, corners: Sequence[Float]) -> Bool:
     return tiles
 
 
-def _tile_range(values: Sequence[Float], anywhere: Bool, count: int) -> tuple[Int32, Int32]:
-    """(first tile, how many) of `count` in a row that three corners' coordinates, pixels, reach; all of `anywhere`."""
+def _in_camera(
+    view: KernelCamera, points: Sequence[mt.Vector3f]
+) -> tuple[tuple[list[Float], list[Float]], list[Float]]:
+    """((to the right, down), depth) of points along the axes of `KernelCamera.rays`, which need not stand exactly
+    upright on each other."""
+    right, down, forward = view.right, view.down, view.forward
+    duals = [dr.cross(down, forward), dr.cross(forward, right), dr.cross(right, down)]
+    volume = dr.dot(right, duals[0])
+    arms = [point - view.start for point in points]
+    x, y, z = ([dr.dot(arm, dual) / volume for arm in arms] for dual in duals)
+    return (x, y), [view.near + depth for depth in z]
+
+
+def _tile_range(values: Sequence[Float], count: int) -> tuple[Int32, Int32]:
+    """(first tile, how many) of `count` in a row that three corners' coordinates, pixels, reach."""
     mi = backend.mitsuba()
-    first = dr.floor((_smallest(values) - MARGIN) / TILE)
-    last = dr.floor((_largest(values) + MARGIN) / TILE)
-    start = dr.select(anywhere, 0, mi.Int32(dr.clip(first, 0, count)))
-    end = dr.select(anywhere, count - 1, mi.Int32(dr.clip(last, -1, count - 1)))
-    return start, dr.maximum(end - start + 1, 0)
+    first = mi.Int32(dr.clip(dr.floor((_smallest(values) - MARGIN) / TILE), 0, count))
+    last = mi.Int32(dr.clip(dr.floor((_largest(values) + MARGIN) / TILE), -1, count - 1))
+    return first, dr.maximum(last - first + 1, 0)
 
 
 def _smallest(values: Sequence[Float]) -> Float:
-    return dr.minimum(dr.minimum(values[0], values[1]), values[2])
+    return reduce(dr.minimum, values)
 
 
 def _largest(values: Sequence[Float]) -> Float:
-    return dr.maximum(dr.maximum(values[0], values[1]), values[2])
+    return reduce(dr.maximum, values)

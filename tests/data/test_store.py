@@ -324,9 +324,30 @@ def test_a_frame_that_is_gone_or_shows_nothing_is_said(tmp_path):
     written = [writer.write_frame(name, nothing, picture_of(nothing)) for name in TRAIN]
     assert [frame.sunlit for frame in written] == [None, None]
     assert writer.read_written(TRAIN[0]).sunlit is None
-    (tmp_path / "data/id/train_00001.png").unlink()
-    with pytest.raises(WorkError, match="train_00001 is not"):
-        writer.finish(make_frames(TRAIN), [], POINTS, COLORS, trimesh.creation.box(), written=written)
+    victim = tmp_path / "data/id/train_00001.png"
+    content = victim.read_bytes()
+    victim.write_bytes(content[:-1])
+    for _ in range(2):
+        with pytest.raises(WorkError, match="train_00001 is not"):
+            writer.finish(make_frames(TRAIN), [], POINTS, COLORS, trimesh.creation.box(), written=written)
+        victim.unlink(missing_ok=True)
+
+
+def test_a_sensors_numbers_are_asked_for_where_they_have_a_place(tmp_path):
+    for raw, given in (("",), None), ((), np.zeros((HEIGHT, WIDTH), np.uint16)):
+        writer = DatasetWriter(tmp_path / f"data{len(raw)}", SCENE, raw=raw)
+        with pytest.raises(ValueError, match="raw: expected"):
+            writer.write_frame("train_00000", *make_frame(), given)
+        assert not list(writer.root.glob("*/*"))
+
+
+def test_what_cannot_be_made_again_is_said(root):
+    (root / "transforms.json").unlink()
+    (root / "SHA256SUMS").unlink()
+    (root / "id/train_00001.png").unlink()
+    (root / "id/train_00001.png").mkdir()
+    with pytest.raises(InputError, match=r"id/train_00001\.png: cannot be removed"):
+        DatasetWriter(root, SCENE, resume=True)
 
 
 def test_broken_truth_is_named(root):

@@ -61,6 +61,32 @@ def test_all_that_rays_meet_is_covered(distance, count, size):
         assert not (hit & ~covered).any()
 
 
+def test_a_cameras_axes_need_not_stand_upright_on_each_other():
+    """As long as `Camera` takes them: a pose rounded to three decimals."""
+    focal, limb = 30_000.0, (1.3**2 - 1) ** -0.5
+    for skew in (4.5e-4, -4.5e-4):
+        pose = look_at(np.array([0.0, -1.3, 0.0]), [0.0, 0.0, 0.0])
+        pose[:3, 2] += skew * pose[:3, 0]
+        camera = Camera(pose, 128, 64, focal, focal, 64 - focal * (limb - skew), 32.0)
+        hit, covered = hits_and_coverage(trimesh.creation.icosphere(6), camera)
+        assert 0.2 < hit.mean() < 0.8
+        assert not (hit & ~covered).any()
+
+
+def test_close_above_a_plain_the_sky_is_not_traced():
+    """Most triangles are beside or behind the camera, or reach to both sides of its plane."""
+    side = np.linspace(-1, 1, 151)
+    points = np.stack([*np.meshgrid(side, side), np.zeros((151, 151))], axis=-1).reshape(-1, 3)
+    corner = (np.arange(150)[:, None] * 151 + np.arange(150)).ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 151], corner[:, None] + [1, 152, 151]])
+    plain = trimesh.Trimesh(points, faces, process=False)
+    for fov_deg in (60.0, 5.0, 1.0):
+        camera = Camera.from_fov(look_at(np.array([0.1, 0.0, 0.03]), [0.1, 1.0, 0.03]), SIZE, SIZE, fov_deg)
+        hit, covered = hits_and_coverage(plain, camera)
+        assert not (hit & ~covered).any()
+        assert covered.mean() < hit.mean() + 0.1 < 0.65
+
+
 def test_a_triangle_that_begins_behind_the_camera_is_covered():
     """Its corner there would be seen in the middle, its surface is seen at the right."""
     mesh = trimesh.Trimesh([[0, -1, 0], [0.8, 5, 0.3], [0.8, 5, -0.3]], [[0, 1, 2]], process=False)

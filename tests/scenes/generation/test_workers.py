@@ -246,7 +246,7 @@ class _Obliging:
         return self
 
     def send(self, specs: list[FrameSpec]) -> None:
-        self.answers += [*(WrittenFrame(spec.name, (), None) for spec in specs), None]
+        self.answers += [*(WrittenFrame(spec.name, (), (), None) for spec in specs), None]
 
     def receive(self) -> WrittenFrame | None:
         return self.answers.pop(0)
