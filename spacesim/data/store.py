@@ -74,8 +74,8 @@ _OPTIONAL = ("radiance_earth", "radiance_background")
 _FILTERED = ("radiance", "alpha", *_OPTIONAL)
 RAW_MONOCHROME, RAW_COLOR = ("",), ("_r", "_g", "_b")  #: suffixes of the files in raw/
 DEPTH_UNIT = "depth_unit"  #: key of scene.json: metres a step of depth/*.png, where that is no millimetre
-MANY_FILES = 1000  #: of frames, whose reading is told: it takes some 5 ms each
 DEPTH_MARGIN = 1.05  #: beyond the farthest surface that coarser steps reach
+MANY_FILES = 1000  #: of frames, from which on it is said that they are read: that takes some 5 ms each
 _MOST_STEPS = np.iinfo(np.uint16).max
 
 _log = logging.getLogger(__name__)
@@ -178,7 +178,7 @@ class FrameWriter:
         """Write the files of frame `name`, e.g. "train_00012".
 
         image: the picture, uint8 [H, W], [H, W, 3] or [H, W, 4]; raw: a sensor's digital numbers, uint16 [H, W], or
-        [3, H, W] for R, G and B, where the writer has suffixes of raw/, else None.
+        [3, H, W] for R, G and B, where the writer has suffixes of raw/, else None. Raises ValueError for others.
         """
         if (raw is None) != (not self.raw):
             raise ValueError(f"raw: expected {'numbers for raw/' if self.raw else 'none'}, found others")
