@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -141,6 +140,12 @@ def sunlit_share(shadow: np.ndarray) -> tuple[float, int]:
     return int(counts[SHADOW_LIT]) / max(seen, 1), seen
 
 
+def _sunlit(shadow: np.ndarray) -> float | None:
+    """As in `WrittenFrame`."""
+    share, seen = sunlit_share(shadow)
+    return share if seen else None
+
+
 @dataclass(frozen=True)
 class WrittenFrame:
     """A frame whose files are on the disk."""
@@ -184,35 +189,35 @@ class FrameWriter:
             raise ValueError(f"raw: expected {'numbers for raw/' if self.raw else 'none'}, found others")
         surface = truth.object_id > 0
         pictures = {
-            "images": image,
-            "shadow": truth.shadow,
-            "silhouette": np.where(surface, 255, 0).astype(np.uint8),
-            "id": truth.object_id.astype(np.uint8),
-            "depth": self._encode_depth(truth.depth, surface),
+            f"images/{name}": image,
+            f"shadow/{name}": truth.shadow,
+            f"silhouette/{name}": np.where(surface, 255, 0).astype(np.uint8),
+            f"id/{name}": truth.object_id.astype(np.uint8),
+            f"depth/{name}": self._encode_depth(truth.depth, surface),
         }
-        contents = {f"{folder}/{name}.png": partial(png_bytes, pixels) for folder, pixels in pictures.items()}
         if raw is not None:
             planes = raw[None] if raw.ndim == 2 else raw
-            for suffix, plane in zip(self.raw, planes, strict=True):
-                contents[f"raw/{name}{suffix}.png"] = partial(png_bytes, plane)
+            pictures |= {f"raw/{name}{suffix}": plane for suffix, plane in zip(self.raw, planes, strict=True)}
         layers = {f.name: getattr(truth, f.name) for f in fields(Truth)}
         present = {key: value for key, value in layers.items() if value is not None}
-        contents[f"gt/{name}.exr"] = partial(exr_bytes, present)
-        written = {}
-        for path, encode in contents.items():
-            content = encode()
+        written: dict[str, tuple[str, int]] = {}
+
+        def write(path: str, content: bytes) -> None:
             write_bytes(self.root / path, content, durable=False)
             written[path] = hashlib.sha256(content).hexdigest(), len(content)
-        digests, sizes = zip(*(written[path] for path in self._files_of(name)), strict=True)
-        share, seen = sunlit_share(truth.shadow)
-        return WrittenFrame(name, digests, sizes, share if seen else None)
+
+        for path, pixels in pictures.items():
+            write(f"{path}.png", png_bytes(pixels))
+        write(f"gt/{name}.exr", exr_bytes(present))
+        digests, sizes = zip(*map(written.__getitem__, self._files_of(name)), strict=True)
+        return WrittenFrame(name, digests, sizes, _sunlit(truth.shadow))
 
     def read_written(self, name: str) -> WrittenFrame:
         """What `write_frame` has returned, of a frame that is there. Raises InputError where a file cannot be read."""
-        share, seen = sunlit_share(read_png(self.root / "shadow" / f"{name}.png"))
+        sunlit = _sunlit(read_png(self.root / "shadow" / f"{name}.png"))
         files = [self.root / path for path in self._files_of(name)]
-        sizes = tuple(path.stat().st_size for path in files)
-        return WrittenFrame(name, tuple(map(digest_of, files)), sizes, share if seen else None)
+        digests = tuple(map(digest_of, files))  # says what cannot be read
+        return WrittenFrame(name, digests, tuple(map(os.path.getsize, files)), sunlit)
 
     def _encode_depth(self, depth: np.ndarray, surface: np.ndarray) -> np.ndarray:
         steps = np.round(np.where(surface, depth, 0).astype(np.float64) / self.depth_unit)
