@@ -5,15 +5,18 @@ and L. Ohlsson, "Conservative rasterization", GPU Gems 2, 2005).
 """
 
 from collections.abc import Sequence
-from functools import reduce
+from dataclasses import dataclass, replace
+from functools import lru_cache, reduce
 
 import drjit as dr
 import numpy as np
 
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
-from spacesim.backend.arrays import Bool, Float, Int32, UInt32
+from spacesim.backend.arrays import Bool, Float, Int32
 from spacesim.backend.upload import upload
+from spacesim.data.images import undistort_points
+from spacesim.data.records import Camera
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, Units, record_on_cuda
 from spacesim.scenes.scene import Scene
 
@@ -21,40 +24,72 @@ TILE = 4  #: pixels of a side
 MARGIN = 1.0  #: pixels about a triangle: far more than single precision is off
 CLOSE = 1e-3 * RADIUS  #: from the camera's plane: where a triangle that comes closer is seen is not asked
 SLACK = 1e-6 * RADIUS  #: by which a triangle is beyond a plane: more than single precision is off
+BORDER = 33  #: points along a side of a picture
+SPARE = 1.01  #: by which more is shown than these points are apart
+WIDEST = 4.0  #: times as wide, at most: what is farther is traced
 FARTHEST = 1e5  #: pixels from the picture: edges of triangles with corners beyond are not asked
 
 
+@dataclass(frozen=True)
+class Tiles:
+    """Of a picture without distortion: where the scene may be seen."""
+
+    marks: Bool  #: [ceil(H / TILE) ceil(W / TILE) + 1], row by row; at the end: all over
+    width: int  #: pixels
+    height: int  #: pixels
+    focal: list[Float]  #: fx and fy, pixels
+    centre: list[Float]  #: cx and cy, pixels
+
+    def may_show(self, x: Float, y: Float) -> Bool:
+        """Whether the scene may be seen in directions (x, y, 1). Outside the picture it may be anywhere."""
+        mi = backend.mitsuba()
+        column, row = (at * focal + centre for at, focal, centre in zip((x, y), self.focal, self.centre, strict=True))
+        is_inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        tile = mi.UInt32(row) // TILE * _across(self) + mi.UInt32(column) // TILE
+        marked = dr.gather(mi.Bool, self.marks, tile, is_inside)
+        return marked | ~is_inside | dr.gather(mi.Bool, self.marks, mi.UInt32(_count(self)))
+
+
 class Coverage:
-    """Of a scene's pictures. distortion: of the lens, as `Renderer` takes it; where it distorts, all is covered."""
+    """Of a scene's pictures. distortion: of the lens, as `Renderer` takes it"""
 
     def __init__(self, scene: Scene, units: Units, distortion: Sequence[float]) -> None:
         corners = units.points(np.asarray(scene.mesh.triangles).reshape(-1, 3)).reshape(-1, 9)
-        self._corners = [] if any(distortion) else [upload(column) for column in corners.T]
+        self._corners, self._units = [upload(column) for column in corners.T], units
+        self._distortion = tuple(distortion) if any(distortion) else ()
         self._mark = record_on_cuda(_mark_tiles)
 
-    def tiles(self, view: KernelCamera) -> Bool:
-        """[ceil(H / TILE) ceil(W / TILE) + 1], row by row: where the scene may be seen; at the end: all over."""
-        if not self._corners:
-            return dr.opaque(backend.mitsuba().Bool, True, _count(view) + 1)
-        return self._mark(view, self._corners)
+    def tiles(self, camera: Camera) -> Tiles:
+        """Of what `camera` sees through the lens, as a picture without distortion shows that."""
+        if self._distortion:
+            wider = _widening(camera.width, camera.height, camera.fx, camera.fy, self._distortion)
+            camera = replace(camera, fx=camera.fx / wider, fy=camera.fy / wider)
+        view = KernelCamera.of(camera, self._units)
+        marks = self._mark(view, self._corners)
+        return Tiles(marks, view.width, view.height, view.focal, view.centre)
 
 
-def is_covered(tiles: Bool, view: KernelCamera, pixel: UInt32) -> Bool:
-    """Whether the scene may be seen in pixels (index row by row)."""
-    bools = backend.mitsuba().Bool
-    tile = pixel // view.width // TILE * _across(view) + pixel % view.width // TILE
-    return dr.gather(bools, tiles, tile) | dr.gather(bools, tiles, _count(view))
+@lru_cache(maxsize=64)
+def _widening(width: int, height: int, fx: float, fy: float, distortion: tuple[float, ...]) -> float:
+    """How many times as wide a picture without distortion is, both about their centres, that shows what this one's
+    border does."""
+    along, end = np.linspace(-1, 1, BORDER), np.ones(BORDER)
+    u, v = np.concatenate([[along, end], [along, -end], [end, along], [-end, along]], axis=1)
+    with np.errstate(all="ignore"):
+        x, y = undistort_points(u * width / (2 * fx), v * height / (2 * fy), distortion)
+        times = np.abs([2 * fx / width * x, 2 * fy / height * y])
+    return float(min(np.max(times[np.isfinite(times)], initial=1.0) * SPARE, WIDEST))
 
 
-def _across(view: KernelCamera) -> int:
+def _across(view: KernelCamera | Tiles) -> int:
     return -(-view.width // TILE)
 
 
-def _down(view: KernelCamera) -> int:
+def _down(view: KernelCamera | Tiles) -> int:
     return -(-view.height // TILE)
 
 
-def _count(view: KernelCamera) -> int:
+def _count(view: KernelCamera | Tiles) -> int:
     return _across(view) * _down(view)
 
 

@@ -18,12 +18,12 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
-from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.readback import AsyncArray
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.data.records import Camera, Sun, Truth
 from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
-from spacesim.scenes.coverage import Coverage, is_covered
+from spacesim.scenes.coverage import Coverage, Tiles
 from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scene import Scene, load
@@ -128,12 +128,12 @@ class Renderer:
     ) -> tuple[list[AsyncArray], list[AsyncArray] | None]:
         """Sums of all passes (under the Sun, by the Earth's light, None without)."""
         view = KernelCamera.of(camera, self._loaded.units)
-        tiles, earthlit = self._coverage.tiles(view), self._loaded.earthlit
+        tiles, earthlit = self._coverage.tiles(camera), self._loaded.earthlit
         sunlight = self._launch_passes(self._loaded.sunlit, view, tiles, seed, spp)
         return sunlight, self._launch_passes(earthlit, view, tiles, (*seed, _EARTH), spp) if earthlit else None
 
     def _launch_passes(
-        self, scene: mt.Scene, view: KernelCamera, tiles: Bool, seed: Sequence[int], spp: int
+        self, scene: mt.Scene, view: KernelCamera, tiles: Tiles, seed: Sequence[int], spp: int
     ) -> list[AsyncArray]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint = backend.mitsuba().UInt32
@@ -185,7 +185,7 @@ def _trace_paths(
     distortion: Sequence[float],
     scene: mt.Scene,
     view: KernelCamera,
-    tiles: Bool,
+    tiles: Tiles,
     noise: _Noise,
     spp: int,
 ) -> Float:
@@ -197,8 +197,9 @@ def _trace_paths(
     index = dr.arange(mi.UInt32, samples)
     pixel = index // spp
     offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
-    ray, _ = view.rays(pixel, offset, distortion)
-    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=is_covered(tiles, view, pixel))
+    x, y = view.directions(pixel, offset, distortion)
+    ray, _ = view.rays_to(x, y)
+    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=tiles.may_show(x, y))
     channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
     dr.eval(channels)
     *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)

@@ -85,11 +85,18 @@ class KernelCamera:
     ) -> tuple[mt.RayDifferential3f, Float]:
         """Rays through pixels (index row by row), each at an `offset` in [0, 1)^2 from the pixel's upper left; and how
         far from the camera they start."""
+        return self.rays_to(*self.directions(pixel, offset, distortion))
+
+    def directions(self, pixel: UInt32, offset: mt.Point2f, distortion: Sequence[float]) -> tuple[Float, Float]:
+        """(x, y) to the right and down, of the directions (x, y, 1) of `rays`."""
         mi = backend.mitsuba()
         x = (mi.Float(pixel % self.width) + offset.x - self.centre[0]) / self.focal[0]
         y = (mi.Float(pixel // self.width) + offset.y - self.centre[1]) / self.focal[1]
-        if distortion:
-            x, y = undistort_points(x, y, distortion)
+        return undistort_points(x, y, distortion) if distortion else (x, y)
+
+    def rays_to(self, x: Float, y: Float) -> tuple[mt.RayDifferential3f, Float]:
+        """`rays` in the `directions` (x, y, 1)."""
+        mi = backend.mitsuba()
         aside = x * self.right + y * self.down
         length = dr.sqrt(1 + x * x + y * y)
         start = mi.Point3f(self.start + self.near * aside)
