@@ -366,16 +366,17 @@ def test_counters_over_steps(command):
         assert 2_000 * 59 * 3 * 4 / 1e6 < row["arrays' peak, MB"] < row["process, MB"]  # parameters and two moments
 
 
-@smallest("training.py --backend llvm --sizes 512x32,16385x32 --memory --markdown --json found.json")
+@smallest("training.py --sizes 512x32,16385x32,31200x32 --memory --markdown --json found.json")
 def test_memory_counts_the_parameters_and_their_moments(command, place):
-    """16,385 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take."""
+    """16,385 rows are just above a power of two, to which Dr.Jit rounds: the most that so many ever take. Where there
+    is a CUDA device, those of 31,200 are moved at once."""
     call(command, ended_alone)
     report = json.loads((place / "found.json").read_text())
-    few, many = (row["bytes a Gaussian"] for row in report["memory"])
+    few, *many = (row["bytes a Gaussian"] for row in report["memory"])
     parameters = 59 * 4
     # values and two moments are there before and after an update; gradients and statistics beside them
     assert 3 * parameters < few < 12 * parameters
-    assert 3 * parameters < many <= 1536
+    assert 3 * parameters < min(many) < max(many) <= 1536
 
 
 @pytest.mark.parametrize("size", PRESETS)

@@ -2,8 +2,8 @@
 
 A part (`adam.parts`) is a few rows and a recorded function. The rows and moments that it replaces go at once: a
 step holds all of them once, and only those of a part twice (docs/research/memory.md). Many rows in one kernel were also
-slower on a CPU. On CUDA, where kernels take less time than to ask for a function, all parts are one of few Gaussians,
-and of those with light, whose networks take more memory than that.
+slower on a CPU. On CUDA, where kernels take less time than to ask for a function, all parts are one of few Gaussians
+whose rows fill their memory, and of those with light, whose networks take more memory than that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,6 +26,7 @@ from spacesim.splat.train.optimizer.packing import PackedArray, load, store
 from spacesim.splat.train.stages import mean, shape_values
 
 AT_ONCE = 2**15  #: Gaussians with harmonics, at most, all of whose parts are one recorded function on CUDA
+FULL = 0.95  #: of the power of two to which Dr.Jit rounds rows, at least: all at once then take 1,530 bytes a Gaussian
 Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
 
 
@@ -138,7 +139,9 @@ class Update:
 
 def moves_at_once(gaussians: Gaussians) -> bool:
     """Whether all parts are one recorded function."""
-    return select() == "cuda" and (gaussians.features is not None or gaussians.count <= AT_ONCE)
+    count = gaussians.count
+    fits = count <= AT_ONCE and count >= FULL * 2 ** (count - 1).bit_length()
+    return select() == "cuda" and (gaussians.features is not None or fits)
 
 
 def _replace(

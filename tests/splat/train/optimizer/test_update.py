@@ -147,6 +147,16 @@ def test_parts_move_alike_at_once_and_one_by_one(surfels, lit, monkeypatch):
     assert all(len(np.unique(row)) > 1 for row in found[0])
 
 
+def test_all_parts_move_at_once_where_rows_fill_their_memory(monkeypatch):
+    monkeypatch.setattr(update_module, "select", lambda: "cuda")
+    counts = 12_822, 15_564, 15_565, 16_384, 16_385, 31_129, 31_622, 32_768, 32_769, 65_536
+    drawn = {count: Gaussians.random(count, 1.0, 0.1) for count in counts}
+    at_once = [count for count in counts if update_module.moves_at_once(drawn[count])]
+    assert at_once == [15_565, 16_384, 31_622, 32_768]
+    lit = Gaussians.from_rows([*drawn[16_385].shape_rows(), dr.zeros(ad.Float, 4 * 16_385)])
+    assert update_module.moves_at_once(lit)
+
+
 def test_a_step_of_many_holds_few_rows_twice(monkeypatch):
     """Beyond the rows and their moments, less than half as much again, where all at once would be as much again."""
     monkeypatch.setattr(update_module, "moves_at_once", lambda _: False)
