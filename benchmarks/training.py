@@ -29,12 +29,13 @@ from support.pipeline import SSIM_WEIGHT, Pipeline
 from support.synthetic import NEVER, STILL, still_trainer, write_dataset
 
 from spacesim import backend
+from spacesim.data.errors import InputError
 from spacesim.data.files import write_bytes
 from spacesim.data.images import load_image
 
 MEMORY_SIZES = "16384x64,16385x64,20000x64,21846x64,30000x64,32769x64,43691x64,65537x64,87382x64,131073x64,200000x64"
 """A power of two; just above one and above 4/3 of one, where a Gaussian takes most; others."""
-SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "30000x256"}
+SIZES = {"cuda": "31622x1024,101958x1024,165495x1024,1000000x1024", "llvm": "30000x256"}
 ROUNDS = 3  #: of ours and OpenSplat in turn
 WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
 IN_A_ROW = 20  #: steps that are timed together
@@ -52,9 +53,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, metavar="N", help="counters over N steps with refinement")
     options = parser.parse_args()
     if options.steps is not None and options.steps < counters.MIN_STEPS:
-        raise SystemExit(f"--steps: expected at least {counters.MIN_STEPS}, found {options.steps}")
+        raise InputError(f"--steps: expected at least {counters.MIN_STEPS}, found {options.steps}")
     if options.opensplat and not options.opensplat.is_file():
-        raise SystemExit(f"--opensplat: expected OpenSplat's binary, found no file {options.opensplat}")
+        raise InputError(f"--opensplat: expected OpenSplat's binary, found no file {options.opensplat}")
     name = backend.select(options.backend)
     usual = MEMORY_SIZES if options.memory else (growth.SIZES if options.growth else SIZES)[name]
     sizes = common.parse_sizes(options.sizes or usual)

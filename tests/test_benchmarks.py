@@ -21,7 +21,7 @@ import pytest
 from tiny import Outcome, captured, outcome
 
 from spacesim import backend
-from spacesim.data.errors import InputError
+from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import look_at
 from spacesim.data.images import linear_from_srgb, load_image, read_png, write_png
 from spacesim.data.importers.writing import ImportedFrame, write_dataset
@@ -162,7 +162,7 @@ def test_quartiles_and_tables():
 def test_sizes_that_are_none_are_refused(text):
     from support import common
 
-    with pytest.raises(SystemExit, match="--sizes: expected"):
+    with pytest.raises(InputError, match="--sizes: expected"):
         common.parse_sizes(text)
 
 
@@ -179,9 +179,9 @@ def test_what_cannot_be_measured_is_refused(arguments, sentence, monkeypatch, ca
     from support import common
 
     monkeypatch.setattr(sys, "argv", ["training.py", *arguments])
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit, match="2"):
         common.run_main(training.main)
-    assert sentence in capsys.readouterr().err + str(ended.value)
+    assert sentence in capsys.readouterr().err
 
 
 def test_measurements_are_printed_before_an_unwritable_file_fails(tmp_path, monkeypatch, capsys):
@@ -200,8 +200,9 @@ def test_measurements_are_printed_before_an_unwritable_file_fails(tmp_path, monk
 
 
 def stand_in(path: Path, start: float, step: float) -> Path:
-    """A program that takes OpenSplat's arguments and sleeps, seconds."""
+    """A program that takes OpenSplat's arguments, sleeps, seconds, and writes a file."""
     script = f"import sys, time\nn = int(sys.argv[sys.argv.index('-n') + 1])\ntime.sleep({start} + {step} * n)\n"
+    script += "open(sys.argv[sys.argv.index('-o') + 1], 'w').write('ply')\n"
     path.write_text(f"#!{sys.executable} -IS\n{script}")
     path.chmod(0o755)
     return path
@@ -216,7 +217,10 @@ def test_opensplat_is_timed_without_its_start(tmp_path):
     pairs = [peer_opensplat.run_pair(binary, dataset)]
     assert peer_opensplat.seconds_a_step(pairs) == pytest.approx([5e-3], rel=0.4)
     binary.write_text("#!/bin/sh\necho no such thing >&2\nexit 3\n")
-    with pytest.raises(SystemExit, match="code 3: no such thing"):
+    with pytest.raises(WorkError, match="code 3: no such thing"):
+        peer_opensplat.run_pair(binary, dataset)
+    binary.write_text("#!/bin/sh\nexit 0\n")
+    with pytest.raises(WorkError, match="has written no splats"):
         peer_opensplat.run_pair(binary, dataset)
 
 

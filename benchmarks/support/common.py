@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import platform
 import re
 import subprocess
@@ -9,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from spacesim.splat.train.config import TrainConfig
 
 WARM_UP = 5  #: calls that do not count
-PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim")
+PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim", "FasterGSCudaBackend")
 FIELD_OF_VIEW = 35  #: degrees
 CURVES = "#5a6472", "#b9560f", "#2a66ad", "#3d7a3a"  #: colours of a chart that stands alone
 DISTANCE = float(np.sqrt(18))  #: of the cameras from the centre of a sphere of radius 1: it fills most of the picture
@@ -92,13 +93,13 @@ def natural(text: str) -> int:
 
 
 def parse_sizes(text: str) -> list[tuple[int, int]]:
-    """[(Gaussians, pixels of a side)] of "31622x1024,...". Ends the program with a sentence where it is malformed."""
+    """[(Gaussians, pixels of a side)] of "31622x1024,...". Raises InputError where it is malformed."""
     try:
         sizes = [(int(count), int(pixels)) for count, pixels in (item.split("x") for item in text.split(","))]
     except ValueError:
-        raise SystemExit(f"--sizes: expected GAUSSIANSxPIXELS,..., found {text!r}") from None
+        raise InputError(f"--sizes: expected GAUSSIANSxPIXELS,..., found {text!r}") from None
     if min(min(size) for size in sizes) < 1:
-        raise SystemExit(f"--sizes: expected numbers of at least 1, found {text!r}")
+        raise InputError(f"--sizes: expected numbers of at least 1, found {text!r}")
     return sizes
 
 
@@ -264,20 +265,41 @@ def kernels_in_turn(works: Mapping[str, Work], repeats: int = 7) -> dict[str, Ke
     return {name: Kernels(launches[name], float(np.median(sums[name])), min(sums[name])) for name in works}
 
 
+def _processors() -> tuple[float, float]:
+    """Seconds that the machine's processors have had, and of these such as other guests of its host took (Linux)."""
+    path = Path("/proc/stat")
+    ticks = [float(number) for number in path.read_text().split("\n", 1)[0].split()[1:9]] if path.exists() else [0.0]
+    return sum(ticks), ticks[-1]
+
+
+_BEFORE = os.getloadavg()[0], _processors()  # a benchmark
+
+
 def machine() -> dict[str, str]:
-    """The device and the versions of all that takes part."""
+    """The device, how quiet it was, and the versions of all that takes part."""
     name = backend.select()
     facts = {"backend": name, "device": _gpu() if name == "cuda" else _cpu(), "python": platform.python_version()}
+    load, before = _BEFORE
+    had, stolen = (now - then for now, then in zip(_processors(), before, strict=True))
+    facts["load before"] = f"{load:.2f} of {os.cpu_count()} processors"
+    facts["taken by other guests"] = f"{100 * stolen / max(had, 1e-9):.1f} %"
     if name == "cuda":
         facts["cuda"] = ".".join(map(str, dr.detail.cuda_version()))
     else:
         facts["llvm"] = ".".join(map(str, dr.detail.llvm_version()))
     for package in PACKAGES:
         try:
-            facts[package] = version(package)
+            facts[package] = _version(package)
         except PackageNotFoundError:
             continue
     return facts
+
+
+def _version(package: str) -> str:
+    """Of an installed one, with its commit where pip has it from a repository."""
+    found = distribution(package)
+    origin = json.loads(found.read_text("direct_url.json") or "{}").get("vcs_info", {})
+    return f"{found.version} {origin.get('commit_id', '')[:7]}".strip()
 
 
 def _gpu() -> str:

@@ -1,7 +1,13 @@
 """Faster-GS as the peer of the benchmarks: the same splats and camera, its rasterizer, its Adam, fused_ssim's loss.
 
-Built from https://github.com/nerficg-project/faster-gaussian-splatting, commit 3cb0b75: `pip install
---no-build-isolation ./FasterGSCudaBackend`, and https://github.com/rahul-goel/fused-ssim; spacesim installs neither.
+Measured: https://github.com/nerficg-project/faster-gaussian-splatting, commit 3cb0b75, and
+https://github.com/rahul-goel/fused-ssim, commit 0ac916a; spacesim installs neither. With torch and the CUDA toolkit:
+
+    pip install --no-build-isolation git+https://github.com/rahul-goel/fused-ssim@0ac916a \
+        "git+https://github.com/nerficg-project/faster-gaussian-splatting@3cb0b75#subdirectory=FasterGSCudaBackend"
+
+CUDA 13 has no `cub::Max()`: clone Faster-GS and write `::cuda::maximum<>()` in its place in
+rasterization/include/kernels_forward.cuh before `pip install --no-build-isolation ./FasterGSCudaBackend`.
 """
 
 from functools import lru_cache
@@ -12,7 +18,10 @@ import torch
 from FasterGSCudaBackend.torch_bindings import FusedAdam, RasterizerSettings, diff_rasterize, rasterize
 
 from spacesim.data.records import Camera
-from support.peer_torch import Step, StepInputs, Tensors, fused_similarity, tensor, upload
+from support.peer_torch import Step, StepInputs, Tensors, fused_similarity, has_fused_ssim, tensor, upload
+
+if not has_fused_ssim():
+    raise ImportError("its loss, fused_ssim, is not installed")
 
 NEAR, FAR = 0.01, 1e4
 BASES = 16  #: of spherical harmonics of degree 3

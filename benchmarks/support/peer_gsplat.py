@@ -1,6 +1,7 @@
 """gsplat as the peer of the benchmarks: the same splats, the same camera, its own rasterizer and torch around it.
 
-gsplat 1.5 and torch with CUDA are needed, which spacesim does not install. gsplat compiles its kernels at first use.
+gsplat 1.5.3 (https://github.com/nerfstudio-project/gsplat) and torch with CUDA are needed, which spacesim does not
+install: `pip install gsplat==1.5.3`. gsplat compiles its kernels at first use.
 """
 
 from typing import Any
@@ -67,10 +68,10 @@ class Frame:
         self.image = self._blend()
         self.gradients = [torch.full_like(plane, 1e-3) for plane in self.image]
 
-    def whole(self) -> None:
-        """Parameters to picture, without gradients."""
+    def whole(self) -> torch.Tensor:
+        """Parameters to picture [3, H, W], without gradients."""
         with torch.no_grad():
-            rasterize(self.splats, self.camera, 3)
+            return _picture(self.splats, self.camera)
 
     def bin(self) -> int:
         """Sort the projected splats into tiles. Returns the number of pairs."""

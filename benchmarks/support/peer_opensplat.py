@@ -1,4 +1,7 @@
-"""OpenSplat's CPU mode as a peer: its binary on a data set of ours, in Nerfstudio's layout, refinement off."""
+"""OpenSplat's CPU mode as a peer: its binary on a data set of ours, in Nerfstudio's layout, refinement off.
+
+Built from https://github.com/pierotofy/OpenSplat, v1.1.5, with a CPU build of libtorch; spacesim installs neither.
+"""
 
 import os
 import subprocess
@@ -8,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spacesim.data.errors import WorkError
 from spacesim.data.records import Dataset
 
 STEPS = 40, 120  #: of the short and the long run; their difference is free of start-up and of writing the result
@@ -15,7 +19,7 @@ OFF = "1000000000"
 
 
 def run_pair(binary: Path, dataset: Dataset) -> tuple[float, float]:
-    """Seconds of a short and of a long run. Ends the program with a sentence where the binary fails."""
+    """Seconds of a short and of a long run. Raises WorkError where the binary fails."""
     return _seconds(binary, dataset, STEPS[0]), _seconds(binary, dataset, STEPS[1])
 
 
@@ -27,7 +31,8 @@ def seconds_a_step(pairs: list[tuple[float, float]]) -> list[float]:
 
 def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
-        command = [str(binary.resolve()), str(dataset.root), "-o", str(Path(folder) / "splat.ply"), "-n", str(steps)]
+        splats = Path(folder) / "splat.ply"
+        command = [str(binary.resolve()), str(dataset.root), "-o", str(splats), "-n", str(steps)]
         command += ["-d", "1", "--num-downscales", "0", "--sh-degree", "3", "--sh-degree-interval", "1"]
         command += ["--refine-every", OFF, "--warmup-length", OFF]
         start = time.perf_counter()
@@ -35,8 +40,10 @@ def _seconds(binary: Path, dataset: Dataset, steps: int) -> float:
         try:
             done = subprocess.run(command, capture_output=True, text=True, env=environment)
         except OSError as error:
-            raise SystemExit(f"--opensplat: {binary} cannot be run ({error})") from None
-        seconds = time.perf_counter() - start
+            raise WorkError(f"--opensplat: {binary} cannot be run ({error})") from None
+        seconds, has_written = time.perf_counter() - start, splats.is_file()
     if done.returncode != 0:
-        raise SystemExit(f"--opensplat: {binary} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
+        raise WorkError(f"--opensplat: {binary} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
+    if not has_written:
+        raise WorkError(f"--opensplat: {binary} has written no splats: is it OpenSplat?")
     return seconds

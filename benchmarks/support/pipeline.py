@@ -73,6 +73,11 @@ class Pipeline:
         output = render(self.gaussians, self.camera, outputs=("color",))
         dr.eval(output.color, output.alpha)
 
+    def picture(self) -> np.ndarray:
+        """[3, H, W] of `frame`, over black."""
+        width, height = self.size
+        return np.array(render(self.gaussians, self.camera, outputs=("color",)).color).reshape(3, height, width)
+
     @property
     def blended_pairs(self) -> int:
         """Pairs that the tiles walk before all their pixels are opaque, at least one pixel of each being blended."""
