@@ -56,6 +56,11 @@ def has_alpha(path: Path) -> bool:
     return _read_header(path, _is_transparent)
 
 
+def size_and_alpha(path: Path) -> tuple[tuple[int, int], bool]:
+    """(`image_size`, `has_alpha`), of a file that is opened once."""
+    return _read_header(path, lambda picture: (picture.size, _is_transparent(picture)))
+
+
 def _read_header(path: Path, tell: Callable[[PillowImage.Image], T]) -> T:
     try:
         with open_regular(path) as file, PillowImage.open(file) as picture:
