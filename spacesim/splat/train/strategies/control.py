@@ -24,6 +24,10 @@ from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, O
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
 
 
+#: a training of them takes some 150 GB, and an array of up to 42 numbers of each has fewer than an index can tell, 2^32
+MAX_GAUSSIANS = 10**8
+
+
 @dataclass(frozen=True)
 class DensificationConfig:
     """When and by which rules the set of Gaussians is changed, whatever the strategy. Lengths are fractions of the
@@ -48,8 +52,7 @@ class DensificationConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.max_gaussians < 1:
-            raise InputError(f"max_gaussians: expected at least 1, found {self.max_gaussians}")
+        check_ranges(self, max_gaussians=(1, MAX_GAUSSIANS))
         if not 0 < self.prune_opacity < 0.5:  # a reset lowers to twice as much
             raise InputError(f"prune_opacity: expected above 0 and below 0.5, found {self.prune_opacity}")
         if not 0 < self.split_screen_size < float("inf"):
