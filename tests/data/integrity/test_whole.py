@@ -31,7 +31,7 @@ def another_size(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage, sentence",
+    ("damage", "sentence"),
     [
         (cut, "expected a readable image, found a file that is broken or cut off"),
         (empty, "expected PNG, JPEG or another image"),
