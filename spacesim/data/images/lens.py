@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.records import Camera
 
-BLIND = 0.1  #: share of a picture below which the lens that images no more of it can hardly be right
+BLIND = 0.1  #: share of a picture: a lens that images less of it can hardly be right
 
 _SAMPLES, _STEPS = 33, 257  # of each side of a picture, and along a radius
 

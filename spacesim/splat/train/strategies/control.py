@@ -22,10 +22,7 @@ from spacesim.splat.train.strategies.densify import DensificationCounts, append_
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, OnScreen, Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
-
-
-#: a training of them takes some 150 GB, and an array of up to 42 numbers of each has fewer than an index can tell, 2^32
-MAX_GAUSSIANS = 10**8
+MAX_GAUSSIANS = 10**8  #: training so many takes some 150 GB; an array of 42 numbers of each has no more than 2^32
 
 
 @dataclass(frozen=True)
