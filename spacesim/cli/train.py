@@ -3,7 +3,7 @@
 import argparse
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from spacesim import interrupts
@@ -31,7 +31,6 @@ _KEYS = {option: key for option, (key, _) in OPTIONS.items()} | {
 """{option: the field that it sets} of all."""
 
 _NAMES = ("method", "strategy", "preset")  #: of a configuration: `preset` makes it, with all its defaults
-_OF_BOTH = ("iterations", "seed")  #: fields of options that a radiance field has, too
 
 
 def add_options(parser: Parser, arguments: Sequence[str]) -> None:
@@ -80,10 +79,7 @@ def option_of(field: str, options: argparse.Namespace) -> str | None:
     keys = {text.partition("=")[0].strip() for text in options.set}  # of which some are no fields
     if field in options_by_key and field not in keys:
         return options_by_key[field]
-    known = {key.partition(".")[0] for key in keys} | {
-        *TrainConfig.__dataclass_fields__,
-        *NerfConfig.__dataclass_fields__,
-    }
+    known = {key.partition(".")[0] for key in keys} | _fields(TrainConfig) | _fields(NerfConfig)
     return f"--set {field}" if field.partition(".")[0] in known else None
 
 
@@ -91,6 +87,7 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.cli.fields import listing
     from spacesim.data.store import read_dataset
     from spacesim.methods import configuration, train, with_settings
+    from spacesim.nerf.config import NerfConfig
     from spacesim.progress import report_training, show_progress
     from spacesim.splat.train.config import TrainConfig, warm_start
 
@@ -105,7 +102,7 @@ def run(options: argparse.Namespace) -> None:
     if isinstance(config, TrainConfig):
         if chosen.pop("warm_start", False) and config.warm_start is None:
             config = replace(config, warm_start=warm_start(config.preset or "fast"))
-    elif others := [key for key in chosen if key not in _OF_BOTH]:
+    elif others := [key for key in chosen | own if key.partition(".")[0] in _fields(TrainConfig) - _fields(NerfConfig)]:
         raise InputError(f"{others[0]}: expected with a method of Gaussians, found with {config.method}")
     try:
         config = with_settings(config, chosen | own)
@@ -124,6 +121,10 @@ def run(options: argparse.Namespace) -> None:
         f"{options.out}: {size} after {config.iterations} iterations in "
         f"{done.training['seconds']:.0f} s on {done.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
+
+
+def _fields(config: type) -> set[str]:
+    return {field.name for field in fields(config)}
 
 
 def parse_setting(text: str) -> tuple[str, JsonValue]:

@@ -28,7 +28,7 @@ from spacesim.data.files import (
     write_bytes,
     write_json,
 )
-from spacesim.data.images import Undistortion, exr_bytes, load_image, png_bytes, read_exr, read_png
+from spacesim.data.images import Undistortion, check_size_of, exr_bytes, load_image, png_bytes, read_exr, read_png
 from spacesim.data.integrity.manifest import check_manifest, digest_of, read_manifest, write_manifest
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import read_points, write_points
@@ -390,10 +390,7 @@ def find_unreadable_files(path: Path) -> list[str]:
 
 def _read_label(path: Path, camera: Camera) -> np.ndarray:
     pixels = read_png(path)
-    size = pixels.shape[:2]
-    if size != (camera.height, camera.width):
-        expected = f"{camera.width}x{camera.height}"
-        raise InputError(f"{path}: expected {expected} pixels as the camera says, found {size[1]}x{size[0]}")
+    check_size_of(path, (pixels.shape[1], pixels.shape[0]), camera)
     return pixels
 
 

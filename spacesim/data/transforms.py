@@ -26,15 +26,16 @@ from spacesim.data.earth import EARTH_ALBEDO, Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, as_path, read_json
 from spacesim.data.geometry import OPENCV_FROM_OPENGL
-from spacesim.data.images import image_size
+from spacesim.data.images import check_lens, image_size
 from spacesim.data.integrity.manifest import NAME as DIGESTS
-from spacesim.data.records import SUN_WORDS, Camera, Dataset, Frame, Sun, as_numbers
+from spacesim.data.records import MAX_SIDE, SUN_WORDS, Camera, Dataset, Frame, Sun, as_numbers
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")
 DEPTH_UNITS = "depth_unit_scale_factor", "integer_depth_scale"  #: keys: Nerfstudio's name, instant-ngp's
 MILLIMETRE = 1e-3  #: metres: Nerfstudio's default
 MAX_DEPTH_UNIT = 1e30  #: metres a step
+OFF_CENTRE = 100  #: sizes of a picture from it at which its principal point may be
 FARTHEST = 1e9  #: metres from the origin at which a camera may be: nothing is drawn beyond
 _HOLD_OUT = 8
 _SPLITS = ("train", "val", "test")
@@ -157,7 +158,8 @@ def read_views(path: Path) -> dict[str, Frame]:
         try:
             if "w" not in values or "h" not in values:
                 raise InputError("expected w and h, the size in pixels, found none")
-            camera, lens, sun = _read_camera(values, path), _read_distortion(values), _read_sun(values)
+            camera, sun = _read_camera(values, path), _read_sun(values)
+            lens = _read_distortion(values, camera)
         except InputError as error:
             raise InputError(f"{path}: frame {name}: {error}" if name else f"{path}: {error}") from None
         frames[name] = Frame(name, camera, sun, distortion=lens)
@@ -235,7 +237,8 @@ def _read_frame(source: Path, meta: Json, entry: Json, file_path: str) -> Frame:
     try:
         if not os.path.isfile(image):
             raise InputError("expected an image file, found something else")
-        camera, distortion, sun = _read_camera(values, image), _read_distortion(values), _read_sun(values)
+        camera, sun = _read_camera(values, image), _read_sun(values)
+        distortion = _read_distortion(values, camera)
         time = _number(entry, "time") if entry.get("time") is not None else None
         objects = _read_objects(entry)
     except InputError as error:
@@ -299,9 +302,13 @@ def _read_camera(values: Json, image: Path) -> Camera:
 
 
 def check_place(camera: Camera) -> None:
-    """Raise InputError for a camera farther than `FARTHEST` from the origin."""
+    """Raise InputError for a camera farther than `FARTHEST` from the origin, and for a principal point farther from the
+    picture than any crop's is, or `OFF_CENTRE` times its size."""
     if np.abs(camera.position).max() > FARTHEST:
         raise InputError(f"expected a camera within {FARTHEST:g} m of the origin, found it at {camera.position}")
+    reach = max(MAX_SIDE, OFF_CENTRE * camera.width, OFF_CENTRE * camera.height)
+    if max(abs(camera.cx), abs(camera.cy)) > reach:
+        raise InputError(f"expected cx and cy within {reach} pixels, found {camera.cx:g} and {camera.cy:g}")
 
 
 def _focal_length(values: Json, key: str, angle_key: str, size: int) -> float | None:
@@ -329,11 +336,12 @@ def _read_pose(values: Json) -> np.ndarray:
     return pose
 
 
-def _read_distortion(values: Json) -> tuple[float, ...]:
+def _read_distortion(values: Json, camera: Camera) -> tuple[float, ...]:
     """Brown-Conrady k1, k2, p1, p2, k3, or () where all are 0."""
     coefficients = tuple(_number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     if _number(values, "k4", 0.0) != 0:
         raise InputError("expected distortion k1, k2, k3, p1, p2, found k4 as well")
+    check_lens(camera, coefficients)
     return coefficients if any(coefficients) else ()
 
 
@@ -343,14 +351,19 @@ def _read_sun(values: Json) -> Sun | None:
 
 
 def _read_direction(values: Json) -> Sun | None:
-    if "sun_direction" in values:
-        try:
-            return Sun(np.asarray(values["sun_direction"], np.float64))
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
+    named = None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
-        return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
-    return None
+        named = Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
+    if "sun_direction" not in values:
+        return named
+    try:
+        sun = Sun(np.asarray(values["sun_direction"], np.float64))
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
+    if named and sun.direction @ named.direction < math.cos(math.radians(1)):
+        angles = " and ".join(f"{angle:.1f}" for angle in sun.angles)
+        raise InputError(f"expected sun_azimuth_deg and sun_elevation_deg of its sun_direction, {angles}, found others")
+    return sun
 
 
 def _read_earth(values: Json) -> Earth | None:

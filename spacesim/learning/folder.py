@@ -17,6 +17,7 @@ from spacesim import backend
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.identity import same_digest, training_digest
+from spacesim.data.integrity.whole import check_pictures
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Dataset
 from spacesim.data.structure import Rules, structure
@@ -70,6 +71,8 @@ def open_folder(out: Path, described: JsonDict, resume: bool, read_config: ReadC
     where another training is at work in it."""
     with lock_folder(out):
         check_folder(out, described, resume, read_config)  # again: another training may have come and gone
+        if resume and (out / "config.json").exists() and not holds_training(out):
+            log.info("%s: no checkpoint is there; training starts from the beginning", out)
         remove_leftovers(out)
         write_json(out / "config.json", described)
         yield
@@ -82,7 +85,7 @@ def check_folder(out: Path, described: JsonDict, resume: bool, read_config: Read
         if holds_training(out):  # else nothing is there that could be lost
             _check_resumable(out, described, resume, read_config)
     elif out.exists() and not out.is_dir():
-        raise InputError(f"{out}: expected an empty or new folder for the run, found no folder")
+        raise InputError(f"{out}: expected an empty or new folder for the run, found a file")
     elif holds_files(out):
         raise InputError(f"{out}: expected an empty or new folder for the run, found other files in it")
 
@@ -163,7 +166,9 @@ def run_name(path: Path) -> str:
 
 
 def describe_data(dataset: Dataset) -> JsonDict:
-    """What a run remembers of its data: enough to find it again and to notice another one in its place."""
+    """What a run remembers of its data: enough to find it again and to notice another one in its place. Raises
+    InputError where a training picture is not whole: a run that has begun knows its pictures as whole files."""
+    check_pictures(dataset, dataset.train)
     return {
         "path": str(dataset.root.resolve()),
         "digest": training_digest(dataset),

@@ -140,4 +140,5 @@ def added_light(prediction: Prediction, to: Prediction) -> Prediction:
 
 def _check_knows_earth(run: CanPredict, name: str) -> None:
     if not run.knows_earth:
-        raise InputError(f"{name}: expected a run that has learned the Earth's light (light.earth), found {run.path}")
+        expected = "expected a run that has learned the Earth's light (light.earth)"
+        raise InputError(f"{name}: {expected}, found {run.path}, trained without it")

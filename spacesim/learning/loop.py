@@ -148,10 +148,17 @@ class TrainingLoop(ABC):
         should_stop: Callable[[], bool] = lambda: False,
     ) -> None:
         """Train from `self.iteration` to the end. Raises KeyboardInterrupt after a step and its checkpoint where it is
-        asked to stop, WorkError where the loss is not finite."""
-        config, left = self.config, self.time_left()
+        asked to stop, or InputError where a step cannot read its pictures, WorkError where the loss is not finite."""
+        config, left, loss = self.config, self.time_left(), None
         while self.iteration < config.iterations:
-            loss = self.step()
+            before = self.iteration
+            try:
+                loss = self.step()
+            except InputError:
+                if loss is not None and self.iteration == before and math.isfinite(float(loss[0])):
+                    on_checkpoint()
+                    log.info("stopped after iteration %d, which is kept: resume goes on from there", before)
+                raise
             last = self.iteration == config.iterations
             if self.iteration % HISTORY_EVERY == 0 or last:
                 on_progress(self._record(float(loss[0]), left))

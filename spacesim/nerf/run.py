@@ -132,7 +132,8 @@ class NerfRun:
     def _check(self, sun: Sun | None, exposure: float | None) -> None:
         checked_sun(sun, self.relightable, f"a run of {self.config['method']}")
         if exposure is not None:
-            raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {self.path}")
+            expected = "expected a run trained in linear light (light.linear)"
+            raise InputError(f"exposure: {expected}, found {self.path}, trained without it")
 
 
 def load_run(path: str | Path) -> NerfRun:

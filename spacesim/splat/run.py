@@ -326,7 +326,9 @@ def stops(curve: Curve | None, exposure: float | None, source: str) -> float:
     if exposure is None:
         return 0.0
     if curve is None:
-        raise InputError(f"exposure: expected a run trained in linear light (light.linear), found {source}")
+        raise InputError(
+            f"exposure: expected a run trained in linear light (light.linear), found {source}, trained without it"
+        )
     if not abs(exposure) <= MAX_EXPOSURE:
         raise InputError(f"exposure: expected -{MAX_EXPOSURE} to {MAX_EXPOSURE} EV, found {exposure}")
     return exposure - curve.exposure

@@ -111,6 +111,29 @@ def test_suns(tmp_path):
     angles = {"sun_azimuth_deg": 90, "sun_elevation_deg": 0}
     frame = read_dataset(write_folder(tmp_path, ["a.png"], frame=angles)).train[0]
     np.testing.assert_allclose(frame.sun.direction, [0, 1, 0], atol=1e-15)
+    read_dataset(write_folder(tmp_path, ["a.png"], frame={**angles, "sun_direction": [0.01, 2, 0]}))
+    write_folder(tmp_path, ["a.png"], frame={**angles, "sun_direction": [1, 1, 0]})
+    with pytest.raises(InputError, match=r"a.png: expected sun_azimuth_deg .* of its sun_direction, 45.0 and 0.0"):
+        read_dataset(tmp_path)
+
+
+def test_a_principal_point_may_lie_where_crops_have_it_and_no_farther(tmp_path):
+    for cx in (-4000, 16_384):
+        assert read_dataset(write_folder(tmp_path, ["a.png"], cx=cx)).train[0].camera.cx == cx
+    write_folder(tmp_path, ["a.png"], cx=1e6)
+    with pytest.raises(InputError, match=r"frame a\.png: expected cx and cy within 16384 pixels, found 1e\+06 and 6"):
+        read_dataset(tmp_path)
+
+
+def test_a_lens_that_folds_over_nearly_all_of_its_picture_is_refused(tmp_path):
+    """Of 0.8 by 0.6 at depth 1: k1 = -2 turns back 0.41 from the axis, imaged at 0.27; k1 = -50 images 0.05."""
+    for k1 in (-2, -0.8, 50):
+        dataset = read_dataset(write_folder(tmp_path, ["a.png"], camera_model="OPENCV", k1=k1))
+        assert dataset.train[0].distortion[0] == k1
+    for k1 in (-50, -1e30):
+        write_folder(tmp_path, ["a.png"], camera_model="OPENCV", k1=k1)
+        with pytest.raises(InputError, match=r"frame a\.png: expected a lens that images 10 % of the picture before"):
+            read_dataset(tmp_path)
 
 
 def test_earths(tmp_path):

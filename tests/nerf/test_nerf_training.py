@@ -389,6 +389,7 @@ def test_the_commands(spacesim, tiny_data, tmp_path):
     [
         (["--strategy", "mcmc"], "--strategy: expected with a method of Gaussians, found 'mcmc' with nerf"),
         (["--init", "mesh"], "--init: expected with a method of Gaussians, found with nerf"),
+        (["--set", "light.shadow.bias=10"], "--set light.shadow.bias: expected with a method of Gaussians, found with"),
         (["--max-gaussians", "5"], "--max-gaussians: expected with a method of Gaussians"),
         (["--warm-start"], "--warm-start: expected with a method of Gaussians"),
         (["--sun", "unknown"], "--sun: expected with a method of Gaussians"),

@@ -57,7 +57,7 @@ def read_exr(path: Path, size: tuple[int, int] | None = None) -> dict[str, np.nd
     expected = _count_exr_parts(content)  # OpenEXR itself only warns, and leaves out what it cannot read
     if expected is None:
         raise InputError(f"{path}: expected an EXR file, found one that is cut off or damaged")
-    width, height = _exr_size(content)
+    width, height = exr_size(content)
     if size is not None and (width, height) != size:
         expected_size = f"{size[0]}x{size[1]} pixels as the camera says"
         raise InputError(f"{path}: expected {expected_size}, found {width}x{height}")
@@ -107,8 +107,8 @@ def _count_exr_parts(content: bytes) -> int | None:
         return None
 
 
-def _exr_size(content: bytes) -> tuple[int, int]:
-    """(width, height), pixels, of the largest part of an EXR file; (0, 0) where no header says."""
+def exr_size(content: bytes) -> tuple[int, int]:
+    """(width, height), pixels, of the largest part of an EXR file, by its first bytes; (0, 0) where no header says."""
     largest, position = (0, 0), 8
     try:
         while content[position]:

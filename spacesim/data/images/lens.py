@@ -1,11 +1,17 @@
 """Pictures of a lens: where it images a direction (Brown-Conrady), and resampling to a pinhole camera."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
+from spacesim.data.errors import InputError
 from spacesim.data.records import Camera
+
+BLIND = 0.1  #: share of a picture: a lens that images less of it can hardly be right
+
+_SAMPLES, _STEPS = 33, 257  # of each side of a picture, and along a radius
 
 Coordinate = Any  #: numbers, or arrays of numpy or of Dr.Jit, of one shape
 
@@ -55,6 +61,34 @@ class Undistortion(Resampling):
         r2 = x * x + y * y
         inside &= 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0  # past this the model folds back on itself
         super().__init__(columns, rows, inside)
+
+
+def check_lens(camera: Camera, distortion: tuple[float, ...]) -> None:
+    """Raise InputError for a lens that folds back on itself over nearly all of the picture: no ray reaches what lies
+    beyond. distortion: see `distort_points`; () none"""
+    if not any(distortion):
+        return
+    numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+    share = _share_before_fold(*numbers, distortion)
+    if share < BLIND:
+        expected = f"expected a lens that images {100 * BLIND:g} % of the picture before it folds back on itself"
+        found = f"k1, k2, p1, p2, k3 of {', '.join(f'{k:g}' for k in distortion)}"
+        raise InputError(f"{expected}, found {100 * share:.2g} % with {found}")
+
+
+@lru_cache(maxsize=64)
+def _share_before_fold(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]
+) -> float:
+    """Of a picture, what is nearer to its principal point than where the lens folds, along a radius."""
+    u = (np.linspace(0, width, _SAMPLES) - cx) / fx
+    v = (np.linspace(0, height, _SAMPLES) - cy) / fy
+    places = np.hypot(u, v[:, None])
+    k1, k2, _, _, k3 = distortion
+    with np.errstate(all="ignore"):
+        images, _ = distort_points(np.linspace(0, places.max(), _STEPS), np.zeros(_STEPS), (k1, k2, 0.0, 0.0, k3))
+        folds = ~(np.diff(images) > 0)
+    return float((places < images[folds.argmax()]).mean()) if folds.any() else 1.0
 
 
 def distort_points(

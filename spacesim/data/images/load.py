@@ -59,10 +59,15 @@ def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> t
 
 def _read_sized(path: Path, camera: Camera) -> np.ndarray:
     pixels = read_png(path)
-    camera_size, size = f"{camera.width}x{camera.height}", f"{pixels.shape[1]}x{pixels.shape[0]}"
-    if size != camera_size:
-        raise InputError(f"{path}: expected {camera_size} pixels as the camera says, found {size}")
+    check_size_of(path, (pixels.shape[1], pixels.shape[0]), camera)
     return pixels
+
+
+def check_size_of(path: Path, size: tuple[int, int], camera: Camera) -> None:
+    """Raise InputError where a picture of `size` (width, height) is not of the camera's."""
+    if size != (camera.width, camera.height):
+        expected = f"{camera.width}x{camera.height} pixels as the camera says"
+        raise InputError(f"{path}: expected {expected}, found {size[0]}x{size[1]}")
 
 
 def read_labels(path: Path, camera: Camera) -> np.ndarray:

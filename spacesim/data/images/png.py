@@ -33,7 +33,7 @@ def read_png(path: Path, content: bytes | None = None) -> np.ndarray:
     try:
         with PillowImage.open(io.BytesIO(content)) as picture:
             _check_size(path, picture)
-            _check_png(content)
+            _check_png(path, content)
             if picture.mode == "F":
                 raise InputError(f"{path}: expected whole numbers of 8 or 16 bits a channel, found floating-point ones")
             if picture.mode in _GREY_16:
@@ -54,6 +54,11 @@ def image_size(path: Path) -> tuple[int, int]:
 def has_alpha(path: Path) -> bool:
     """Whether an image file has transparency, from its header alone. Raises InputError as `read_png` does."""
     return _read_header(path, _is_transparent)
+
+
+def size_and_alpha(path: Path) -> tuple[tuple[int, int], bool]:
+    """(`image_size`, `has_alpha`), of a file that is opened once."""
+    return _read_header(path, lambda picture: (picture.size, _is_transparent(picture)))
 
 
 def _read_header(path: Path, tell: Callable[[PillowImage.Image], T]) -> T:
@@ -77,9 +82,9 @@ def _check_size(path: Path, picture: PillowImage.Image) -> None:
     check_memory(DECODING * width * height, f"{path}: a picture of {width} x {height} pixels")
 
 
-def _check_png(content: bytes) -> None:
-    """Raises ValueError where a chunk of a PNG file is not what its checksum says (ISO/IEC 15948, 5.3): Pillow passes
-    over that of the pixels. Files of other formats pass."""
+def _check_png(path: Path, content: bytes) -> None:
+    """Raises InputError where a chunk of a PNG file is not what its checksum says (ISO/IEC 15948, 5.3): Pillow passes
+    over that of the pixels; struct.error or ValueError where it is cut off. Files of other formats pass."""
     if not content.startswith(_PNG_SIGNATURE):
         return
     view, position = memoryview(content), len(_PNG_SIGNATURE)
@@ -87,7 +92,8 @@ def _check_png(content: bytes) -> None:
         size, kind = struct.unpack_from(">I4s", content, position)
         end = position + 8 + size
         if struct.unpack_from(">I", content, end)[0] != zlib.crc32(view[position + 4 : end]):
-            raise ValueError(f"the checksum of its chunk {kind.decode('ascii', 'replace')} is another")
+            name = kind.decode("ascii", "replace")
+            raise InputError(f"{_unreadable(path)} (the checksum of its chunk {name} is another)")
         position = end + 4
         if kind == b"IEND":
             return
@@ -116,4 +122,8 @@ def png_bytes(pixels: np.ndarray) -> bytes:
 def _describe_failure(path: Path, error: BaseException) -> str:
     if isinstance(error, UnidentifiedImageError):  # EXR among them
         return f"{path}: expected PNG, JPEG or another image that Pillow reads, found a damaged or another file"
-    return f"{path}: expected a readable image, found a file that is broken or cut off ({error})"
+    return _unreadable(path)
+
+
+def _unreadable(path: Path) -> str:
+    return f"{path}: expected a readable image, found a file that is broken or cut off"

@@ -12,14 +12,13 @@ from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
-from spacesim.data.images import Resampling, Undistortion, has_alpha, image_size, read_png, resample
+from spacesim.data.images import BLIND, Resampling, Undistortion, has_alpha, image_size, read_png, resample
 from spacesim.data.importers.lenses import Lens
 from spacesim.data.importers.masks import read_silhouette
 from spacesim.data.importers.writing import ImportedFrame
 from spacesim.data.records import Camera, Image, Sun
 
 _UNDISTORTING = 120  # bytes a pixel, for a while
-_BLIND = 0.1  # share of its pixels below which a camera can hardly be right
 _COARSE = 64  # pixels
 
 _log = logging.getLogger(__name__)
@@ -95,7 +94,7 @@ class FrameImporter:
 
     def _warn_of_blindness(self, lens: Lens, path: Path) -> None:
         """Once of a lens."""
-        if lens not in self._warned and (share := self._seen_share(lens)) < _BLIND:
+        if lens not in self._warned and (share := self._seen_share(lens)) < BLIND:
             self._warned.add(lens)
             _log.warning(
                 "%s: its lens images %.2g %% of the picture, the rest is unknown: its parameters may be wrong",

@@ -23,7 +23,7 @@ from spacesim.data.files import (
     write_bytes,
     write_json,
 )
-from spacesim.data.images import read_png, write_png
+from spacesim.data.images import check_lens, read_png, write_png
 from spacesim.data.integrity.manifest import write_manifest
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera, Dataset, Sun
@@ -138,11 +138,12 @@ def write_dataset(
 
 
 def _check(source: str, frames: Sequence[ImportedFrame], entries: Sequence[JsonMapping]) -> None:
-    """Raises InputError, before anything is written, for a camera that is too far away and where two frames would be
+    """Raises InputError, before anything is written, for a camera that cannot be and where two frames would be
     written to one file."""
     for frame in frames:
         try:
             check_place(frame.camera)
+            check_lens(frame.camera, frame.distortion)
         except InputError as error:
             raise InputError(f"{source}: {frame.name}: {error}") from None
     for key in ("file_path", *_PARTS.values()):

@@ -117,10 +117,13 @@ class Trainer(TrainingLoop):
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
         degree = min(config.sh_degree, index // config.sh_every)
+        numbers = range(index * count, (index + 1) * count)
+        # all are read before anything changes: one that cannot be leaves the state as it was
+        views = [self.pictures.taught(self.views, number, index) for number in numbers]
         if self.light:
             self._look_around(self.light)
         rows = self.gaussians.rows()
-        results = [self._forward_backward(rows, degree, index * count + i) for i in range(count)]
+        results = [self._forward_backward(rows, degree, *pair) for pair in zip(numbers, views, strict=True)]
         del rows  # so that old ones go as new ones come
         self._step_gaussians(degree, results)
         if self.light:
@@ -175,10 +178,10 @@ class Trainer(TrainingLoop):
         dr.sync_thread()
         self.seconds["refinement"] += time.perf_counter() - start
 
-    def _forward_backward(self, rows: list[Float], degree: int, number: int) -> ViewResult:
+    def _forward_backward(self, rows: list[Float], degree: int, number: int, view: TrainingView) -> ViewResult:
         """Forward, loss, backward for one view, `number` of the training."""
         view_pass = self._view_pass
-        view = self.pictures.shown(self.pictures.taught(self.views, number, self.iteration))
+        view = self.pictures.shown(view)
         watched = self.strategy.observes_step(self.iteration + 1) and not self._warming(self.iteration)
         attraction = self._attraction(view)
         target = self._target_image(number, view, attraction)

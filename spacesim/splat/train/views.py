@@ -17,6 +17,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.images import load_image
+from spacesim.data.integrity.whole import check_truth
 from spacesim.data.records import Camera, Dataset, Frame, Truth
 from spacesim.data.store import load_truth
 from spacesim.learning.lights import sunlit_frames
@@ -55,7 +56,8 @@ class TrainingViews:
     suns: every frame must name its Sun; see `sunlit_frames`
     truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
-    Raises InputError where a frame has not what it must have, and where `sunlit_frames` does.
+    Raises InputError where a frame has not what it must have, or its truth is not whole, and where `sunlit_frames`
+    does.
     """
 
     def __init__(
@@ -74,6 +76,8 @@ class TrainingViews:
         self.most_pixels = max(f.camera.width * f.camera.height for f in dataset.train)
         largest = 4 * self.most_pixels * (1 + sum(3 if name in ("normal", "radiance") else 1 for name in truth))
         self._used = sunlit_frames(dataset) if suns else list(range(len(dataset.train)))
+        if traced:
+            check_truth(dataset, [dataset.train[index] for index in self._used])
         self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=2)(self._shuffle)
         in_memory, on_device = kept_bytes()

@@ -144,7 +144,7 @@ def test_cut_off_png_is_refused(tmp_path):
     content = (tmp_path / "a.png").read_bytes()
     for length in (0, 20, 60, 1000, len(content) // 2):
         (tmp_path / "cut.png").write_bytes(content[:length])
-        with pytest.raises(InputError, match=r"cut\.png"):
+        with pytest.raises(InputError, match=r"cut\.png: expected [a-zA-Z, ]+$"):
             read_png(tmp_path / "cut.png")
 
 

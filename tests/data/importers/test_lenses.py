@@ -6,6 +6,7 @@ from colmap_files import EXAMPLES, MODELS, NUMBERS, imported, lens_of, project, 
 from PIL import Image
 
 import spacesim as ss
+from spacesim.data.errors import InputError
 from spacesim.data.importers.lenses import LENS_MODELS, Lens
 
 
@@ -92,7 +93,14 @@ def test_what_the_lens_does_not_see_is_unknown(tmp_path):
     np.testing.assert_allclose(image.rgb[24, 32], np.array([10, 20, 30]) / 255, atol=1e-6)
 
 
-@pytest.mark.parametrize("lens", [("OPENCV", (-1e10, 0.0, 0.0, 0.0)), ("OPENCV_FISHEYE", (1e10, -1e10, 0.0, 0.0))])
+def test_a_lens_that_folds_over_its_picture_is_refused_before_anything_is_written(tmp_path):
+    camera = ("OPENCV", 16, 12, (20.0, 20.0, 8.0, 6.0, -50.0, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="view 0: expected a lens that images 10 % of the picture before it folds"):
+        imported(project(tmp_path / "src", ring(3, cameras={1: camera})), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("lens", [("OPENCV", (1e10, 0.0, 0.0, 0.0)), ("OPENCV_FISHEYE", (1e10, -1e10, 0.0, 0.0))])
 def test_a_lens_that_images_nothing_is_warned_of_once(tmp_path, caplog, lens):
     name, others = lens
     camera = (name, 16, 12, (20.0, 20.0, 8.0, 6.0, *others))

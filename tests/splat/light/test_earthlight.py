@@ -363,7 +363,7 @@ def test_what_cannot_be_is_named(spacesim, small_lit_dataset, tmp_path):
         train(small_lit_dataset, tmp_path / "run", needed)
     blind = train(small_lit_dataset, tmp_path / "blind", replace(CONFIG, iterations=1))
     done = spacesim("render", blind.path, "--sun", "none", "--out", tmp_path / "a.png")
-    assert done.is_refusal("--sun", "light.earth", blind.path)
+    assert done.is_refusal("--sun", "light.earth", f"found {blind.path}, trained without it")
     plain = train(small_lit_dataset, tmp_path / "plain", replace(preset("demo", "vanilla"), iterations=1))
     refused = spacesim("render", plain.path, "--earth", "0,0", "--out", tmp_path / "a.png")
     assert refused.is_refusal("--earth", "expected a run that the Sun relights", plain.path)

@@ -174,6 +174,7 @@ def test_values_that_are_no_light_have_no_exposure(small_lit_dataset, tmp_path):
     run = train(small_lit_dataset, tmp_path / "run", replace(linear(), light=light))
     frame = small_lit_dataset.test[0]
     with pytest.raises(
-        InputError, match=r"exposure: expected a run trained in linear light \(light.linear\), found .*run"
+        InputError,
+        match=r"exposure: expected a run trained in linear light \(light.linear\), found .*run, trained without it",
     ):
         run.predict(frame.camera, frame.sun, exposure=0.0)

@@ -1,10 +1,13 @@
 """Training as a whole: it learns, it repeats to the bit, it survives interruption."""
 
 import json
+import logging
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera
 from spacesim.data.store import read_points, write_points
 from spacesim.learning.cameras import focus_point
+from spacesim.learning.folder import checkpoints
 from spacesim.splat.export.ply import read_ply, write_ply
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.project import Pinhole
@@ -138,6 +142,54 @@ def test_checkpoints_that_do_not_fit_are_refused(small_dataset, tmp_path):
         with pytest.raises(InputError, match=path.name):
             trainer.restore(path)
     trainer.restore(tmp_path / "good.safetensors")
+
+
+def test_a_picture_that_is_not_whole_is_refused_before_the_first_step(small_dataset, tmp_path):
+    dataset = replace(small_dataset, root=Path(shutil.copytree(small_dataset.root, tmp_path / "data")))
+    path, config = dataset.root / dataset.train[-1].file_path, replace(CONFIG, iterations=1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-10])
+    with pytest.raises(InputError, match=path.name):
+        train(dataset, tmp_path / "run", config)
+    assert not (tmp_path / "run").exists()
+    path.write_bytes(whole)
+    train(dataset, tmp_path / "run", config)
+
+
+def test_training_whose_picture_breaks_is_kept_and_resumed(small_dataset, tmp_path, monkeypatch):
+    """In the middle of a step of several views; with the picture as it was, the model is the same to the bit."""
+    config = replace(CONFIG, views_per_step=3, iterations=90, checkpoint_every=1000)
+    straight = train(small_dataset, tmp_path / "straight", config)
+    monkeypatch.setattr(views, "kept_bytes", lambda: (0, 0))  # so that pictures are read again and again
+    dataset = replace(small_dataset, root=Path(shutil.copytree(small_dataset.root, tmp_path / "data")))
+    path = dataset.root / dataset.train[0].file_path
+    whole = path.read_bytes()
+    with pytest.raises(InputError, match=path.name):
+        train(dataset, tmp_path / "run", config, on_progress=lambda progress: path.write_bytes(b"x"))
+    (checkpoint,) = checkpoints(tmp_path / "run")
+    assert checkpoint.name > "step_00000050"
+    with pytest.raises(InputError, match=path.name):
+        train(dataset, tmp_path / "run", config, resume=True)
+    path.write_bytes(whole)
+    resumed = train(dataset, tmp_path / "run", config, resume=True)
+    name = "model.safetensors"
+    assert (resumed.path / name).read_bytes() == (straight.path / name).read_bytes()
+
+
+def test_a_run_that_has_lost_its_model_begins_anew_and_says_so(small_dataset, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    config = replace(CONFIG, iterations=1)
+    run = train(small_dataset, tmp_path / "run", config, resume=True)
+    assert "no checkpoint" not in caplog.text
+    (run.path / "model.safetensors").unlink()
+    train(small_dataset, tmp_path / "run", config, resume=True)
+    assert f"{run.path}: no checkpoint is there; training starts from the beginning" in caplog.messages
+
+
+def test_a_file_is_no_folder_for_a_run(small_dataset, tmp_path):
+    (tmp_path / "run").write_bytes(b"")
+    with pytest.raises(InputError, match="expected an empty or new folder for the run, found a file"):
+        train(small_dataset, tmp_path / "run", CONFIG)
 
 
 @pytest.mark.threads
