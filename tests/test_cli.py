@@ -483,8 +483,8 @@ def test_export(spacesim, tiny_run, tmp_path):
     [
         (("export", "--ply"), "mesh.ply"),
         (("export", "--mesh"), "points.ply"),
-        (("export", "--html"), "scene.json"),
         (("render", "--out"), "images/test_00000.png"),
+        (("verify", "--camera-density"), "images/test_00000.png"),
     ],
 )
 def test_files_of_a_dataset_are_not_overwritten_and_others_are(spacesim, tiny_run, tiny_data, tmp_path, words, name):
@@ -494,14 +494,40 @@ def test_files_of_a_dataset_are_not_overwritten_and_others_are(spacesim, tiny_ru
     command, option = words
     few = ("--views", 3, "--voxel", 0.1) if option == "--mesh" else ()
     before = contents(data)
+    what = tiny_data if command == "verify" else tiny_run
     for path in (data / name, tmp_path / "link" / name):
-        assert spacesim(command, tiny_run, option, path, *few).is_refusal(path, "no dataset's own")
+        assert spacesim(command, what, option, path, *few).is_refusal(path, "no dataset's own")
     assert contents(data) == before
     other = data / f"of_mine{Path(name).suffix}"
     other.write_bytes(b"old")
-    if option != "--html":  # which takes its time
-        assert spacesim(command, tiny_run, option, other, *few).code == 0
-        assert len(other.read_bytes()) > 100
+    assert spacesim(command, what, option, other, *few).code == 0
+    assert len(other.read_bytes()) > 100
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(f"export RUN --{form} OUT" for form in ("ply", "glb", "spz", "usd", "mesh", "html")),
+        "compose SCENE --out made --ply OUT",
+        "report EVAL --out OUT",
+        "verify DATA --camera-density OUT",
+        "render RUN --out OUT",
+        "render RUN --kind albedo --out OUT",
+        "locate RUN DATA --out OUT",
+    ],
+)
+def test_a_file_is_written_to_no_name_of_another_kind(
+    spacesim, tiny_run, tiny_data, tiny_eval, tmp_path, monkeypatch, words
+):
+    monkeypatch.chdir(tmp_path)
+    run = Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    (tmp_path / "scene.toml").write_text('models = [{run = "run"}]\n')
+    before = contents(tmp_path)
+    places = {"RUN": run, "DATA": tiny_data, "EVAL": tiny_eval, "SCENE": "scene.toml"}
+    for out in ("run/model.safetensors", "scene.toml", "lit.txt"):
+        command = [str({**places, "OUT": out}.get(word, word)) for word in words.split()]
+        assert spacesim(*command).is_refusal(f"{out}: expected a file name that ends in .")
+    assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("form", ["glb", "spz", "usd"])

@@ -9,7 +9,7 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser, resolution
 from spacesim.cli.printing import WANTS_FILTER
 from spacesim.data.errors import InputError
-from spacesim.data.integrity.manifest import check_unlisted
+from spacesim.data.integrity.outputs import check_output
 
 SUMMARY, NEEDS_BACKEND = "several runs in one scene: pictures, depth, object numbers, shadows, a video", True
 
@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.splat.export.ply import write_ply
 
     if options.ply is not None:
-        check_unlisted(options.ply)
+        check_output(options.ply, "ply")
     interrupts.set_resume_command("the same command")
     scene = load_scene(options.scene)
     if options.ply is not None and not isinstance(scene.composition, GaussianComposition):

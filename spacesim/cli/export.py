@@ -12,7 +12,7 @@ from spacesim import backend, interrupts
 from spacesim.cli.parser import Parser, angles, angles_or_none
 from spacesim.cli.printing import KNOWS_ONE_LIGHT, NO_EARTH, RELATIVE, WANTS_FILTER
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.integrity.manifest import check_unlisted
+from spacesim.data.integrity.outputs import check_output
 
 if TYPE_CHECKING:
     from spacesim.data.earth import Earth
@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> None:
             _check_absent(name, getattr(options, name), ("mesh",))
     for name in (*SPLATS, "mesh", "html"):
         if getattr(options, name) is not None:
-            check_unlisted(getattr(options, name))
+            check_output(getattr(options, name), name)
     if labels is not None:
         _export_labels(options, labels)
     elif options.mesh is not None:
@@ -114,10 +114,9 @@ def _export_splats(options: argparse.Namespace, form: "Form") -> None:
     from spacesim.methods import load_run
     from spacesim.splat.export.bake import bake
     from spacesim.splat.export.frame import FileFrame
-    from spacesim.splat.export.splats import Y_UP, check_suffix, write_splats
+    from spacesim.splat.export.splats import Y_UP, write_splats
 
     out: Path = getattr(options, form)
-    check_suffix(out, form)
     frame = FileFrame(options.up or ("y" if form in Y_UP else "z"), _scale(options), options.recentre)
     backend.select(options.backend)
     run = load_run(options.path).gaussian_run
@@ -144,7 +143,7 @@ def _scale(options: argparse.Namespace) -> float:
 
 
 def _export_mesh(options: argparse.Namespace) -> None:
-    from spacesim.data.mesh import VertexSurface, mesh_suffix, write_mesh
+    from spacesim.data.mesh import VertexSurface, write_mesh
     from spacesim.data.records import Sun
     from spacesim.data.store import read_dataset
     from spacesim.methods import load_run
@@ -154,7 +153,7 @@ def _export_mesh(options: argparse.Namespace) -> None:
     from spacesim.splat.export.frame import FileFrame
     from spacesim.splat.export.mesh import MeshConfig, cameras_around, depth_of, mesh_of_depths
 
-    holds_colors = mesh_suffix(options.mesh) != ".stl"
+    holds_colors = options.mesh.suffix.lower() != ".stl"
     if options.sun is not None and not holds_colors:
         raise InputError(f"sun: expected a .glb, .obj or .ply, which hold colours, found {options.mesh}")
     frame = FileFrame(options.up or "z", _scale(options), options.recentre)

@@ -9,7 +9,7 @@ from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, angles_or_none, view_of
 from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE
 from spacesim.data.errors import InputError
-from spacesim.data.integrity.manifest import check_unlisted
+from spacesim.data.integrity.outputs import check_output
 from spacesim.learning.prediction import KINDS, MATERIAL_KINDS
 
 SUMMARY, NEEDS_BACKEND = "one picture of a run", True
@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
     from spacesim.learning.pictures import write_material, write_picture
     from spacesim.methods import load_run
 
-    check_unlisted(options.out)
+    check_output(options.out, "picture")
     run = load_run(options.path)
     lit = run.gaussian_run
     if options.sun and not run.relightable:
@@ -51,6 +51,6 @@ def run(options: argparse.Namespace) -> None:
     seen = predict_light(run, camera, sun, light, options.kind == "normal", options.exposure)
     write_picture(seen, options.kind, options.out)
     surface = seen.depth[seen.depth > 0]
-    if options.kind == "depth" and options.out.suffix == ".png" and surface.size:
+    if options.kind == "depth" and options.out.suffix.lower() == ".png" and surface.size:
         print(f"depth: {surface.min():.4g} m is white, {surface.max():.4g} m darkest; .exr has metres", file=sys.stderr)
     interrupts.print_output(options.out)

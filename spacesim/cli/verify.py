@@ -19,8 +19,11 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from spacesim.data.integrity.manifest import NAME
+    from spacesim.data.integrity.outputs import check_output
     from spacesim.data.integrity.verify import has_digests, repair_hint, verify_files
 
+    if options.camera_density is not None:
+        check_output(options.camera_density, "camera density")
     dataset, problems = verify_files(options.data)
     for problem in problems:
         print(problem, file=sys.stderr)

@@ -17,10 +17,10 @@ from spacesim.data.geometry import Array
 from spacesim.data.glb import TRIANGLES, write_glb
 from spacesim.data.images.color import linear_from_srgb
 from spacesim.data.images.png import png_bytes
+from spacesim.data.integrity.outputs import check_output
 
 LEVELS = 256  #: of roughness and of metallic that a glTF texture tells apart; what is between them is read between
 READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
-WRITTEN = (".ply", ".obj", ".glb", ".stl")
 MAX_COORDINATE = 1e9  #: metres; corners beyond it are taken for damage (the Moon is at 3.8e8)
 #: {axis of a file that points up: rotation [3, 3], file from world, where z does and x stays}
 UPRIGHT = {
@@ -195,16 +195,6 @@ def vertex_normals(vertices: Array, faces: np.ndarray) -> Array:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
-def mesh_suffix(path: Path) -> str:
-    """The format that a mesh's file name asks for. Raises InputError for one that `write_mesh` does not know."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in WRITTEN:
-        raise InputError(
-            f"{path}: expected a file name that ends in {', '.join(WRITTEN)}, found {suffix or 'no extension'}"
-        )
-    return suffix
-
-
 @dataclass(frozen=True, eq=False)
 class VertexSurface:
     """What vertices are made of, beside their albedo."""
@@ -230,7 +220,8 @@ def write_mesh(
     """
     import trimesh
 
-    path, suffix = Path(path), mesh_suffix(path)
+    path, suffix = Path(path), Path(path).suffix.lower()
+    check_output(path, "mesh")
     if colors is not None and suffix == ".stl":
         raise InputError(f"{path}: expected a .glb, .obj or .ply, which hold colours, found STL")
     vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T

@@ -21,6 +21,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, remove_leftovers, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
+from spacesim.data.integrity.outputs import check_evaluation_folder, clear_evaluation
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.transforms import check_still
 from spacesim.eval.align import align, as_trained
@@ -91,13 +92,14 @@ def evaluate(
     config: EvaluateConfig | None = None,
     progress: EvaluationProgress | None = None,
 ) -> JsonDict:
-    """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds.
+    """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds. What an earlier
+    evaluation has left in the folder goes.
 
     What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and scored on the
     other.
     progress: called with (frames done, frames in all, the next one's file) before each frame and at the end.
-    Raises InputError where there is no frame to evaluate or the dataset is broken, WorkError where a prediction is not
-    finite.
+    Raises InputError where there is no frame to evaluate, the dataset is broken or `out` holds other files, WorkError
+    where a prediction is not finite.
     """
     config, dataset = config or EvaluateConfig(), check_still(dataset)
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
@@ -309,13 +311,13 @@ def _sun_group(results: Sequence[FrameResult]) -> JsonDict | None:
 
 
 def _prepare(out: Path) -> None:
-    """Make the folder and take away numbers and map of an earlier call: a folder that has numbers is complete."""
+    """Make the folder and take away what an earlier evaluation has left in it."""
     if (out / "transforms.json").exists() or (out / "config.json").exists():
         raise InputError(f"{out}: expected a folder for an evaluation, found a dataset or a run")
+    check_evaluation_folder(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for name in ("metrics.json", density.NAME):
-            (out / name).unlink(missing_ok=True)
+        clear_evaluation(out)
         remove_leftovers(out)
     except OSError as error:
         raise InputError(f"{out}: expected a folder to write to ({error.strerror})") from None

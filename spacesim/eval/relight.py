@@ -77,9 +77,8 @@ def phase_deg(camera: Camera, lit_as: Frame) -> float:
 def write_sweep(
     run: "Predictor", dataset: Dataset, frames: Sequence[Frame], trained: Sequence[Frame], out: Path
 ) -> tuple[JsonDict | None, str]:
-    """Write the pictures below `out`, in place of earlier ones. What metrics.json says of them, None where there are
-    none, and then a sentence why. trained: the frames that the run was trained on"""
-    _forget(out / "relight")
+    """Write the pictures below `out`. What metrics.json says of them, None where there are none, and then a sentence
+    why. trained: the frames that the run was trained on"""
     sweep = plan_sweep(frames, dataset.frames)
     if sweep is None:
         return None, "relight is null: the data has fewer than two Suns."
@@ -105,13 +104,6 @@ def write_sweep(
         steps.append(step)
     visible = predictions[0].visibility is not None
     return {"view": sweep.view.file_path, "visibility": visible, "suns": steps}, ""
-
-
-def _forget(folder: Path) -> None:
-    """Take away the pictures of an earlier call, and nothing else: the folder may be a run that is called like it."""
-    for kind in ("prediction", "visibility", "truth"):
-        for path in folder.glob(f"{kind}_[0-9][0-9].png"):
-            path.unlink(missing_ok=True)
 
 
 def _write_prediction(folder: Path, index: int, prediction: "Prediction") -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.images import srgb_from_linear, write_exr, write_png
 from spacesim.data.images.tone import as_bytes
+from spacesim.data.integrity.outputs import check_output
 from spacesim.learning.prediction import MaterialView, Prediction
 
 LIT, SHADOWED = (222, 222, 216), (58, 64, 82)  #: sRGB colours of visibility 1 and 0
@@ -17,17 +18,16 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     "depth" (PNG: near is bright; EXR: metres), "normal" (PNG: world x, y, z from -1 to 1 as red, green, blue; EXR: the
     vectors) or "shadow" (PNG: `shadow_colors`; EXR: visibility, 1 where all of the Sun is seen).
 
-    Raises InputError for another suffix than .png or .exr, and for shadows of a method without.
+    Raises InputError as `check_output` does, and for shadows of a method without.
     """
-    path, plane = Path(path), getattr(prediction, "visibility" if kind == "shadow" else kind)
+    check_output(path := Path(path), "picture")
+    plane = getattr(prediction, "visibility" if kind == "shadow" else kind)
     if plane is None:
         raise InputError("kind: expected another than shadow, of a run whose method predicts none, found shadow")
-    if path.suffix == ".exr":
+    if path.suffix.lower() == ".exr":
         shown = prediction.linear if kind == "rgb" else None
         layers = {kind: plane} if shown is None else {"linear": shown}
         write_exr(path, {name: layer.astype(np.float32) for name, layer in layers.items()})
-    elif path.suffix != ".png":
-        raise _neither_png_nor_exr(path)
     elif kind == "rgb":
         alpha = np.clip(prediction.alpha, 0, 1)[..., None]
         straight = np.where(alpha > 0, plane / np.maximum(alpha, 1e-6), 0)
@@ -45,21 +45,16 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
 
 def write_material(view: MaterialView, kind: str, path: Path) -> None:
     """kind: "albedo", "specular" (PNG: as sRGB values, straight alpha; EXR: linear), "roughness" or "metallic". Raises
-    InputError for another suffix than .png or .exr."""
+    InputError as `check_output` does."""
+    check_output(path, "picture")
     plane = np.asarray(getattr(view, kind))
-    if path.suffix == ".exr":
+    if path.suffix.lower() == ".exr":
         write_exr(path, {kind: plane.astype(np.float32)})
-    elif path.suffix != ".png":
-        raise _neither_png_nor_exr(path)
     elif plane.ndim == 3:
         alpha = np.clip(view.alpha, 0, 1)[..., None]
         write_png(path, as_bytes(np.concatenate([srgb_from_linear(plane), alpha], axis=-1)))
     else:
         write_png(path, as_bytes(plane))
-
-
-def _neither_png_nor_exr(path: Path) -> InputError:
-    return InputError(f"{path}: expected a file name that ends in .png or .exr")
 
 
 def shadow_colors(prediction: Prediction) -> np.ndarray:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,8 +111,8 @@ def _perform(root: Path, size: Size, work: Experiment, reporting: Reporting) -> 
             evaluated(scene, pair, folder / part, replace(measures, geometry=None), title, reporting)
         elif part == "one-sun":
             other = read_dataset(data_folder(root, part))
-            _draw_depth(run, other, folder / part, size.fully_lit_deg)
-            evaluated(run, other, folder / part, measures, title, reporting)
+            draw = partial(_draw_depth, run, other, folder / part, size.fully_lit_deg)
+            evaluated(run, other, folder / part, measures, title, reporting, draw)
         elif part == "frames":
             with reporting(title, "scenes") as tell:
                 write_json(folder / _last_file(part), time_frames(run, dataset, tell))
@@ -131,14 +132,21 @@ def trained(folder: Path, dataset: Dataset, config: methods.Config, name: str, r
 
 
 def evaluated(
-    run: "Predictor", dataset: Dataset, folder: Path, measures: EvaluateConfig, name: str, reporting: Reporting
+    run: "Predictor",
+    dataset: Dataset,
+    folder: Path,
+    measures: EvaluateConfig,
+    name: str,
+    reporting: Reporting,
+    draw: Callable[[], None] = lambda: None,
 ) -> JsonDict:
-    """What metrics.json of an evaluation and its report hold."""
+    """What metrics.json of an evaluation holds, which its report ends. draw: adds files before that"""
     if (folder / "report.html").exists():
         known: JsonDict = read_json(folder / "metrics.json")
         return known
     with reporting(f"evaluate {name}", "frames") as report:
         metrics = evaluate(run, dataset, folder, measures, report)
+    draw()
     write_report([folder], folder / "report.html")
     return metrics
 

@@ -14,7 +14,7 @@ from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict
 from spacesim.data.images.tone import STANDARD_EXPOSURE, as_bytes, display_values
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.learning.folder import run_name
 from spacesim.serve.protocol import OUTPUTS, Output
 
@@ -128,9 +128,10 @@ class TracedScene:
 
 
 class PredictedRun:
-    """A run of any method, or a composed scene: a `Predictor`. earth: that the Suns of clients light, or hide behind"""
+    """A run of any method, or a composed scene: a `Predictor`. earth: that the Suns of clients light, or hide behind;
+    scene: name of the one that a run was trained on, where that is known"""
 
-    def __init__(self, run: "Predictor", earth: Earth | None = None) -> None:
+    def __init__(self, run: "Predictor", earth: Earth | None = None, scene: str = "") -> None:
         self.run, self.earth = run, earth
         if run.knows_earth and earth is None:
             why = "neither all of its data nor a scene name one and the same"
@@ -139,7 +140,7 @@ class PredictedRun:
         self.outputs = [name for name in PREDICTED if some.get(name, True)]
         path = Path(run.path)
         name = path.stem if path.suffix == ".toml" else run_name(path)
-        self.names = (name, *(part.name for part in run.parts))
+        self.names = tuple(one for one in (scene, name, *(part.name for part in run.parts)) if one)
 
     @property
     def facts(self) -> JsonDict:
@@ -176,7 +177,10 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
             raise InputError(f"spp: expected with a scene, found {spp} with {what}, which is not path-traced")
         if not is_composed:
             run = load_run(path)
-            return PredictedRun(run, _earth_of(run))
+            dataset = _dataset_of(run)
+            if dataset is None:
+                return PredictedRun(run)
+            return PredictedRun(run, _earth_of(run, dataset), str(dataset.scene.get("scene", "")))
         from spacesim.splat.compose import ComposedRun
 
         scene = load_scene(path)
@@ -186,15 +190,18 @@ def load_served(what: str | Path, spp: int | None = None) -> Served:
     return TracedScene(read_scene(what), spp)
 
 
-def _earth_of(run: "Predictor") -> Earth | None:
-    """The one that all frames of the dataset of a run name; None where that is gone, or they name none or several,
-    which a sentence says of a run that these hide the Sun from."""
+def _dataset_of(run: "Predictor") -> Dataset | None:
+    """That a run was trained on; None where that is gone."""
     from spacesim.data.store import read_dataset
 
     data = Path(run.config["data"]["path"])
-    if not (data / "transforms.json").is_file():
-        return None
-    earths = {frame.sun.earth if frame.sun else None for frame in read_dataset(data).frames}
+    return read_dataset(data) if (data / "transforms.json").is_file() else None
+
+
+def _earth_of(run: "Predictor", dataset: Dataset) -> Earth | None:
+    """The one that all frames of the dataset of a run name; None where they name none or several, which a sentence says
+    of a run that these hide the Sun from."""
+    earths = {frame.sun.earth if frame.sun else None for frame in dataset.frames}
     if len(earths) > 1 and run.relightable and not run.knows_earth:
-        _log.warning("serve: the frames of %s name several Earths, none of which hides the Sun here", data)
+        _log.warning("serve: the frames of %s name several Earths, none of which hides the Sun here", dataset.root)
     return earths.pop() if len(earths) == 1 else None

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
 from spacesim.data.images import load_image
+from spacesim.data.integrity.outputs import check_output
 from spacesim.data.records import Camera, Dataset, Frame, Sun
 from spacesim.data.store import intrinsics_of
 from spacesim.data.transforms import read_dataset, read_views
@@ -55,10 +56,12 @@ def locate(
         transforms.json; None: that of the run's data;  sun: of all pictures, in place of those in files
     resume: keep what an interrupted call has found
 
-    Raises InputError where files cannot be read, where a run needs a Sun and none is given, or `out` exists and is not
-    to be resumed, or of other work or cameras. An error of one picture is recorded for that picture.
+    Raises InputError where files cannot be read, where a run needs a Sun and none is given, or `out` is no name of
+    a JSON file, exists and is not to be resumed, or is of other work or cameras. An error of one picture is recorded
+    for that picture.
     """
     check_gaussians(run)
+    check_output(out, "poses")
     start_frames = {} if start is None else read_views(start)
     frames, dataset = _frames(run, images, start_frames, camera)
     for frame in frames:

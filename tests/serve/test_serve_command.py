@@ -54,7 +54,7 @@ def test_a_run_and_a_composed_scene(tiny_run, tiny_data, tmp_path):
     models = "".join(f'[[models]]\nname = "{name}"\nrun = "{tiny_run}"\n' for name in ("below", "above"))
     (tmp_path / "pair.toml").write_text(models + "position = [0.0, 0.0, 1.6]\n")
     for what, name, outputs in (
-        (tiny_run, tiny_run.parent.name, ("rgb", "depth")),
+        (tiny_run, "boxsat", ("rgb", "depth")),
         (tmp_path / "pair.toml", "pair", ("rgb", "object_id")),
     ):
         with started(what) as (_, served, address), CameraClient(address) as client:

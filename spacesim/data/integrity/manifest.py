@@ -59,20 +59,6 @@ def read_manifest(root: Path) -> dict[str, str]:
     return digests
 
 
-def check_unlisted(path: Path) -> None:
-    """Raise InputError where a file that is to be written is one of a dataset, which its SHA256SUMS names."""
-    target = Path(os.path.realpath(path))
-    for folder in target.parents if target.is_file() else ():
-        if not (folder / "transforms.json").is_file():
-            continue
-        try:
-            listed = read_manifest(folder)
-        except InputError:  # of another program, or damaged, which `verify` reports
-            continue
-        if target.relative_to(folder).as_posix() in listed:
-            raise InputError(f"{path}: expected a file that is no dataset's own, found one of {folder}")
-
-
 def check_manifest(root: Path) -> dict[str, str]:
     """{path below `root`: what is wrong, a sentence} of the files that SHA256SUMS names and that are missing, cannot be
     read or have other bytes. Raises InputError where SHA256SUMS is broken."""

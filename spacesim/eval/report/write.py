@@ -10,6 +10,7 @@ import numpy as np
 from spacesim.data import density
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping, read_bytes, write_bytes
+from spacesim.data.integrity.outputs import check_output
 from spacesim.eval.labels import IMAGE, LOWER, SHADOW, SHADOW_MASK, Metric, metric_of
 from spacesim.eval.report.charts import column_histograms, histogram, line_chart, shared_edges
 from spacesim.eval.report.gallery import albedos, depths, gallery
@@ -32,8 +33,9 @@ _RENDER = Metric("render_ms", "Render time", "ms", LOWER, 1, "")
 def write_report(evals: Sequence[Path], out: Path) -> None:
     """Write the page about the EVAL folders `evals` to the file `out`.
 
-    Raises InputError where a folder holds no evaluation or `out` cannot be written.
+    Raises InputError where a folder holds no evaluation or `out` cannot be written, see `check_output`.
     """
+    check_output(Path(out), "report")
     try:
         content = _content(read_evals(evals), Path(out).absolute().parent)
     except (KeyError, TypeError, AttributeError, IndexError) as error:

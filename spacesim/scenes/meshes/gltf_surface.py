@@ -108,9 +108,10 @@ class Surfaces:
         return self._pictures[source]
 
     def _picture(self, image: JsonDict, source: int) -> np.ndarray | None:
-        what = str(image.get("name") or f"image {source}")[:80]
+        uri = str(image.get("uri", ""))
+        file = "" if uri.startswith("data:") else uri
+        what = str(file or image.get("name") or f"image {source}")[:80]
         try:
-            uri = str(image.get("uri", ""))
             if "bufferView" in image:
                 data = self._view(image["bufferView"])
             else:

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from spacesim.data.errors import InputError
+from spacesim.data.mesh import MAX_COORDINATE
 from spacesim.scenes.config import UNITS, UP_AXES
 from spacesim.scenes.materials.table import Material
 from spacesim.scenes.meshes.gltf import read_gltf
@@ -151,18 +152,24 @@ def _factor(units: str, scale: float) -> float:
 def _clean_parts(path: Path, raw: list[RawPart], notes: Notes, two_sided: bool | None) -> list[RawPart]:
     """Parts with faces, under plain and different names, at most MAX_PARTS."""
     if not any(len(part.faces) for part in raw):
-        raise InputError("expected faces, found none")
+        raise _none_left("faces", notes)
     named = [part.named(plain_name(part.name) or "part") for part in raw if len(part.faces)]
     cleaned = [clean_part(part, notes, two_sided is False) for part in named]
     parts = [part for part in cleaned if part is not None]
     if not parts:
-        raise InputError("expected faces with an area and finite vertices, found none")
+        raise _none_left(f"faces with an area and finite vertices within {MAX_COORDINATE:g} m", notes)
     if len(parts) > MAX_PARTS:
         parts = _merge_by_material(parts, notes)
     taken: set[str] = set()
     for part in parts:
         _note_mirrored(part, notes)
     return [part.named(_free_name(part.name, taken)) for part in parts]
+
+
+def _none_left(expected: str, notes: Notes) -> InputError:
+    """Of a file without any, with what was said of faces that were dropped."""
+    dropped = [sentence for sentence in notes.sentences("dropped") if sentence.startswith("faces")]
+    return InputError("; ".join([f"expected {expected}, found none", *dropped]))
 
 
 def _note_mirrored(part: RawPart, notes: Notes) -> None:

@@ -221,7 +221,7 @@ def _picture(image: Any, name: str, files: _Files, notes: Notes) -> np.ndarray |
     """trimesh has opened the image; its pixels are read here, where damage and size are looked after."""
     if id(image) not in files.pictures:
         image.fp.seek(0)
-        files.pictures[id(image)] = decode_image(image.fp.read(), name, notes)
+        files.pictures[id(image)] = decode_image(image.fp.read(), str(image.info.get("file_path", name))[:80], notes)
     return files.pictures[id(image)]
 
 

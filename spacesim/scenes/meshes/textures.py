@@ -125,8 +125,8 @@ def decode_image(data: bytes, what: str, notes: Notes) -> np.ndarray | None:
                 return _rgb_picture(image, what, notes)
     except MemoryError:
         raise
-    except Exception as error:  # Pillow raises what it likes on damaged data
-        notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
+    except Exception:  # Pillow raises what it likes on damaged data
+        notes.drop(_UNDECODED, what)
         return None
     limit = f"{MAX_PICTURE_PIXELS:,} pixels, or {MAX_TEXTURE_PIXELS:,} in all"
     notes.drop(f"textures of more than {limit} are not used", what)
@@ -139,8 +139,8 @@ def check_picture(data: bytes, what: str, notes: Notes) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             Image.open(io.BytesIO(data))
-    except Exception as error:
-        notes.drop(_UNDECODED, f"{what} ({type(error).__name__})")
+    except Exception:
+        notes.drop(_UNDECODED, what)
         raise FileNotFoundError(what) from None
 
 

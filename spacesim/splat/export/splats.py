@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from spacesim.data.errors import InputError
+from spacesim.data.integrity.outputs import check_output
 from spacesim.splat.export.frame import FileFrame
 from spacesim.splat.export.glb import write_gaussian_glb
 from spacesim.splat.export.ply import write_ply
@@ -12,7 +12,6 @@ from spacesim.splat.export.usd import write_usd
 from spacesim.splat.raster.gaussians import Gaussians
 
 Form = Literal["ply", "glb", "spz", "usd"]
-SUFFIXES = {"glb": (".glb",), "spz": (".spz",), "usd": (".usda", ".usd")}  #: of names; a PLY may have any
 Y_UP = ("glb", "spz")  #: formats that say that y points up; the others hold the dataset's axes
 
 
@@ -27,9 +26,9 @@ def write_splats(
     """Write Gaussians with harmonics whose colours are sRGB values, see `bake`, in the file's frame.
 
     antialiased: whether they are drawn with the anti-aliasing filter, which only SPZ can record
-    Raises InputError for a name of another suffix, and as the formats' own functions do.
+    Raises InputError as `check_output` and the formats' own functions do.
     """
-    check_suffix(path, form)
+    check_output(path, form)
     placed = frame.placed(gaussians)
     if form == "ply":
         write_ply(placed, path)
@@ -39,11 +38,3 @@ def write_splats(
         write_spz(placed, path, antialiased, spz_version)
     else:
         write_usd(placed, path, frame.up, frame.scale)
-
-
-def check_suffix(path: Path, form: Form) -> None:
-    """Raise InputError for a file name whose suffix does not show the format."""
-    suffixes = SUFFIXES.get(form, ())
-    if suffixes and path.suffix.lower() not in suffixes:
-        suffix = path.suffix or "no extension"
-        raise InputError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}, found {suffix}")

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import holds_files, write_bytes
+from spacesim.data.files import write_bytes
 from spacesim.data.geometry import direction_from_angles
 from spacesim.data.images import write_exr, write_png
 from spacesim.data.images.sheet import (
@@ -28,6 +28,7 @@ from spacesim.data.images.sheet import (
     font,
 )
 from spacesim.data.images.tone import as_bytes
+from spacesim.data.integrity.outputs import check_sweep_folder, clear_sweep
 from spacesim.data.records import MAX_SIDE, Camera, Sun, check_size
 from spacesim.learning.pictures import shadow_colors
 from spacesim.splat.export.video import INSTALL, Video, encoder
@@ -109,7 +110,7 @@ def sweep(
     kind: "rgb", over black, or "shadow": how much of the Sun is seen, from SHADOWED to LIT;  keep_frames: write every
     picture, too;  report: called with (pictures done, of all);  exposure: EV, see `Run.predict`
     Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, an
-    exposure of one whose colours are sRGB values, a folder that cannot be made, and one of frames that holds some.
+    exposure of one whose colours are sRGB values, a folder that cannot be made or holds other files.
     """
     out = Path(out)
     if kind not in KINDS:
@@ -122,8 +123,7 @@ def sweep(
             "knows one light only; train with the method relight, nerf-relight, or one with shadows, on frames that "
             "name their Sun"
         )
-    if keep_frames and holds_files(out / FRAMES_NAME):
-        raise InputError(f"{out / FRAMES_NAME}: expected an empty folder for the frames, found files in it")
+    check_sweep_folder(out)
     video = _SweepVideo(camera) if encoder() else None
     first = _picture(run, camera, suns[0], kind, exposure)  # what does not fit the run shows before there is a folder
     _make_folder(out)
@@ -170,9 +170,10 @@ def sky_mark(sun: Sun, side: int = LABEL_HEIGHT - 4) -> np.ndarray:
 
 
 def _make_folder(out: Path) -> None:
-    """Before most of the work, not after it."""
+    """Before most of the work, not after it; without what an earlier sweep has left there."""
     try:
         out.mkdir(parents=True, exist_ok=True)
+        clear_sweep(out)
     except OSError as error:
         raise InputError(f"{out}: expected a folder that can be written ({error.strerror})") from None
 

@@ -152,7 +152,7 @@ def test_faces_of_an_obj_that_name_what_is_not_there_are_dropped(tmp_path, broke
         np.testing.assert_array_equal(craft.parts[0].mesh.triangles, [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
         assert "faces that name vertices which are not there are dropped: 1 of idx" in report.dropped
     path.write_text(OBJ_CORNERS + f"f {broken}\n")
-    with pytest.raises(InputError, match="expected faces"):
+    with pytest.raises(InputError, match=r"expected faces, found none; faces that name .* are dropped: 1 of idx"):
         read_mesh(path)
 
 
@@ -304,6 +304,13 @@ def test_obj_without_its_texture_keeps_the_color_and_says_so(tmp_path, mtl, said
     assert any(said in line for line in report.dropped)
 
 
+def test_a_picture_that_breaks_off_is_named(tmp_path):
+    Image.effect_noise((64, 64), 90).save(tmp_path / "half.png")
+    (tmp_path / "half.png").write_bytes((tmp_path / "half.png").read_bytes()[:2000])
+    _, report = read_mesh(write_obj(tmp_path, "newmtl cells\nmap_Kd half.png\nnewmtl paint\nKd 0 0 1\n"))
+    assert "textures that cannot be decoded are not used: half.png" in report.dropped
+
+
 def test_obj_without_its_mtl_gets_grey_paint_and_says_so(tmp_path):
     path = write_obj(tmp_path, "")
     (tmp_path / "paint.mtl").unlink()
@@ -369,9 +376,15 @@ def test_what_is_no_mesh_ends_in_one_sentence(tmp_path, name, content, said):
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_but_nan_ends_in_one_sentence(tmp_path):
+def test_no_vertex_that_can_be_used_ends_in_one_sentence(tmp_path):
     path = ply(tmp_path / "nan.ply", [["nan"] * 3] * 3, [[0, 1, 2]])
     with pytest.raises(InputError, match="finite vertices"):
+        read_mesh(path)
+    path = tmp_path / "far.obj"
+    path.write_text("v 0 0 0\nv 1e30 0 0\nv 0 1e30 0\nf 1 2 3\n")
+    with pytest.raises(
+        InputError, match=r"finite vertices within 1e\+09 m, found none; .* beyond 1e\+09 m are dropped"
+    ):
         read_mesh(path)
 
 

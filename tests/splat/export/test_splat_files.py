@@ -11,10 +11,11 @@ from splats import light_of, random_splats
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.geometry import fibonacci_sphere, look_at
+from spacesim.data.integrity.outputs import SUFFIXES
 from spacesim.data.records import Camera
 from spacesim.splat.export import spz
 from spacesim.splat.export.frame import FileFrame
-from spacesim.splat.export.splats import SUFFIXES, write_splats
+from spacesim.splat.export.splats import write_splats
 from spacesim.splat.export.spz import write_spz
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
@@ -38,7 +39,7 @@ def model(degree: int = 3, count: int = 200) -> Gaussians:
 
 
 def out_of(folder: Path, form: str) -> Path:
-    return folder / f"model{SUFFIXES.get(form, ('.ply',))[0]}"
+    return folder / f"model{SUFFIXES[form][0]}"
 
 
 def again(decoded: Decoded) -> Gaussians:
@@ -232,7 +233,7 @@ def test_no_gaussians(tmp_path, form):
 
 
 def test_what_cannot_be_written_ends_in_a_sentence(tmp_path, monkeypatch):
-    for form in SUFFIXES:
+    for form in ("ply", "glb", "spz", "usd"):
         with pytest.raises(InputError, match=r"model\.txt: expected a file name that ends in \."):
             write_splats(model(), tmp_path / "model.txt", form, FileFrame())
     for values, words in (

@@ -169,11 +169,19 @@ def test_a_run_that_cannot_and_a_folder_that_is_full_are_refused(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(InputError, match=r"file: expected a folder"):
         sweep(Lit(), CAMERA, suns, tmp_path / "file", report=lambda *_: pytest.fail("rendered more than one"))
-    (tmp_path / "frames").mkdir()
-    (tmp_path / "frames" / "0099.png").write_bytes(b"")
-    with pytest.raises(InputError, match="frames"):
-        sweep(Lit(), CAMERA, suns, tmp_path, keep_frames=True)
-    assert not (tmp_path / "sweep.png").exists()
+    with pytest.raises(InputError, match="or one of an earlier sweep, found other files in it"):
+        sweep(Lit(), CAMERA, suns, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_earlier_sweep_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "encoder", lambda: None)
+    sweep(Lit(), CAMERA, suns_around(3), tmp_path, keep_frames=True)
+    (tmp_path / "sweep.mp4").touch()
+    (tmp_path / "frames" / "mine.txt").touch()
+    sweep(Lit(), CAMERA, suns_around(2), tmp_path, keep_frames=True)
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
+    assert left == {"sweep.png", "frames/0000.png", "frames/0001.png", "frames/mine.txt"}
 
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (90, 0), (200, 45), (0, 90), (300, -30)])

@@ -15,6 +15,7 @@ from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, write_bytes
 from spacesim.data.geometry import robust_radius
+from spacesim.data.integrity.outputs import check_output
 from spacesim.learning.folder import run_name
 from spacesim.splat.export.html.colors import NODES, color_steps, tabulate_colors, tells_cosines
 from spacesim.splat.export.html.seen import SIDE as SEEN_SIDE
@@ -44,12 +45,7 @@ def write_page(
     """
     if run.gaussian_count == 0:
         raise InputError(f"{run.path}: expected a run with Gaussians, found none")
-    if Path(path).is_dir():
-        raise InputError(f"{path}: expected a file to write, found a folder")
-    if Path(path).suffix.lower() not in (".html", ".htm"):  # browsers go by it
-        raise InputError(
-            f"{path}: expected a file name that ends in .html, found {Path(path).suffix or 'no extension'}"
-        )
+    check_output(Path(path), "html")
     about, arrays = _content(run, report, earth if run.relightable else None)
     write_bytes(Path(path), _page(run, name or run_name(run.path), about, arrays).encode())
 

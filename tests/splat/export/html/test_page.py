@@ -336,7 +336,9 @@ def test_what_is_no_run_of_gaussians_is_refused(tiny_run, tmp_path, monkeypatch)
     assert call("export", tmp_path / "scene.toml", "--html", out).is_refusal("scene.toml", "a scene")
     assert call("export", tmp_path / "absent", "--html", out).is_refusal("absent")
     assert call("export", tiny_run, "--html", tmp_path).is_refusal(tmp_path, "folder")
-    assert call("export", tiny_run, "--html", tmp_path / "page.txt").is_refusal("page.txt", "ends in .html, found .txt")
+    assert call("export", tiny_run, "--html", tmp_path / "page.txt").is_refusal(
+        "page.txt", "ends in .html or .htm, found .txt"
+    )
     monkeypatch.setattr("spacesim.methods.load_run", lambda path: SimpleNamespace(gaussian_run=None))
     assert call("export", tiny_run, "--html", out).is_refusal("radiance field")
     assert not out.exists()

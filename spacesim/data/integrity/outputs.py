@@ -1,0 +1,145 @@
+"""What is written: a file or a folder takes the place of an earlier one of its own kind, and of nothing else."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+
+from spacesim.data.errors import InputError
+from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.integrity.manifest import NAME as DIGESTS
+from spacesim.data.integrity.manifest import read_manifest
+
+SUFFIXES = {
+    "ply": (".ply",),
+    "glb": (".glb",),
+    "spz": (".spz",),
+    "usd": (".usda", ".usd"),
+    "mesh": (".ply", ".obj", ".glb", ".stl"),
+    "html": (".html", ".htm"),
+    "report": (".html", ".htm"),
+    "picture": (".png", ".exr"),
+    "camera density": (".png",),
+    "poses": (".json",),
+}
+"""{kind of file: suffixes of its names}."""
+
+_RUN = re.compile(
+    r"(config|training|cameras)\.json|(model|poses)\.safetensors|checkpoints/(step_\d+\.safetensors|seconds\.json)"
+)
+_FRAME = "(truth|prediction|error|(shadow|mask)_(truth|prediction)|visibility|(depth|albedo)(_truth)?)"
+_PICTURES = (
+    rf"camera_density\.png|frames/[^/]+/{_FRAME}\.png|relight/(prediction|visibility|truth)_\d\d\.png"
+    r"|geometry/((truth|reconstruction)_\d+\.png|reconstruction\.ply)"
+)
+_EVALUATION = re.compile(rf"metrics\.json|report\.html|{_PICTURES}")
+_UNFINISHED = re.compile(_PICTURES)
+_SWEEP = re.compile(r"sweep\.(png|mp4)|frames/\d{4}\.(png|exr)")
+
+_SAME = {"report": "report.html", "camera density": "camera_density.png"}
+"""{kind of file: what evaluations call theirs}."""
+
+
+def check_output(path: Path, kind: str) -> None:
+    """Raise InputError where a file of one of the kinds of `SUFFIXES` is to be written to a name of another suffix, to
+    a folder, or in the place of a file of a dataset, a run or an evaluation."""
+    if path.is_dir():
+        raise InputError(f"{path}: expected a file to write, found a folder")
+    suffixes = SUFFIXES[kind]
+    if path.suffix.lower() not in suffixes:
+        expected = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
+        raise InputError(f"{path}: expected a file name that ends in {expected}, found {path.suffix or 'no extension'}")
+    target = Path(os.path.realpath(path))
+    for folder in target.parents if target.is_file() else ():
+        owner = _owner(folder, target.relative_to(folder).as_posix(), kind)
+        if owner:
+            raise InputError(f"{path}: expected a file that is no {owner}'s own, found one of {folder}")
+
+
+def _owner(folder: Path, name: str, kind: str) -> str:
+    """Of which product in `folder` the file called `name` there is a part; "" of none."""
+    if (folder / "config.json").is_file() and _RUN.fullmatch(name):
+        return "run"
+    if name != _SAME.get(kind) and _EVALUATION.fullmatch(name) and _is_evaluation(folder):
+        return "evaluation"
+    if (folder / "transforms.json").is_file() and _is_of_dataset(folder, name):
+        return "dataset"
+    return ""
+
+
+def _is_of_dataset(folder: Path, name: str) -> bool:
+    """Whether SHA256SUMS names a file; of a dataset without it, transforms.json, also without a suffix."""
+    with suppress(InputError):  # of another program, or damaged, which `verify` reports
+        if listed := read_manifest(folder):
+            return name in (*listed, DIGESTS)
+    with suppress(InputError):
+        named = {str(PurePosixPath(text)) for text in _texts(read_json(folder / "transforms.json", MAX_LIST_BYTES))}
+        return name == "transforms.json" or bool(named & {name, str(PurePosixPath(name).with_suffix(""))})
+    return False
+
+
+def _texts(value: object) -> Iterator[str]:
+    """All strings in a value of JSON."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts(part)
+
+
+def check_evaluation_folder(out: Path) -> None:
+    """Raise InputError where a folder holds files and no evaluation, finished or interrupted, has written them."""
+    if not _is_evaluation(out):
+        _check_files(out, _UNFINISHED, "evaluation")
+
+
+def _is_evaluation(folder: Path) -> bool:
+    """metrics.json is one of ours."""
+    with suppress(InputError):
+        values = read_json(folder / "metrics.json", MAX_LIST_BYTES)
+        return isinstance(values, dict) and {"schema", "run", "data", "split", "frames"} <= values.keys()
+    return False
+
+
+def clear_evaluation(out: Path) -> None:
+    """Take away all that an evaluation has written into a folder, its numbers before the pictures: a folder that has
+    these is complete. Raises OSError where that fails."""
+    _remove(out, _EVALUATION, ("report.html", "metrics.json"))
+
+
+def check_sweep_folder(out: Path) -> None:
+    """Raise InputError where a folder holds files and no sweep has written them."""
+    if not (out / "sweep.png").is_file():
+        _check_files(out, None, "sweep")
+
+
+def clear_sweep(out: Path) -> None:
+    """Take away all that a sweep has written into a folder. Raises OSError where that fails."""
+    _remove(out, _SWEEP)
+
+
+def _check_files(out: Path, own: re.Pattern[str] | None, what: str) -> None:
+    """own: files that may be there"""
+    if any(own is None or not own.fullmatch(name) for name in _files(out)):
+        expected = f"an empty or new folder, or one of an earlier {what}"
+        raise InputError(f"{out}: expected {expected}, found other files in it")
+
+
+def _files(folder: Path) -> Iterator[str]:
+    """Paths from there of the visible files in and below a folder."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        here = Path(place).relative_to(folder)
+        yield from ((here / name).as_posix() for name in names if not name.startswith("."))
+
+
+def _remove(folder: Path, own: re.Pattern[str], first: Sequence[str] = ()) -> None:
+    """Take away the files that are its `own`, `first` ones before others, and folders that are empty then."""
+    names = [name for name in _files(folder) if own.fullmatch(name)]
+    for name in sorted(names, key=lambda name: (name not in first, *(name != one for one in first))):
+        (folder / name).unlink(missing_ok=True)
+    within = {place for name in names for place in PurePosixPath(name).parents if place.parts}
+    for place in sorted(within, key=lambda place: -len(place.parts)):
+        with suppress(OSError):  # it is not empty
+            (folder / place).rmdir()
