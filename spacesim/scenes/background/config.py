@@ -1,6 +1,6 @@
 """What is drawn behind the objects."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from spacesim.data.errors import expect
 
@@ -27,9 +27,8 @@ class BackgroundConfig:
         expect(0 <= self.share <= 1, "share", "a fraction from 0 to 1", self.share)
         expect(0 <= self.star_gain <= 1e9, "star_gain", "a factor from 0 to 1e9", self.star_gain)
 
-    @classmethod
-    def of(cls, words: str) -> "BackgroundConfig":
-        """The background that has what `words` name: "earth", "stars" or "earth,stars"."""
+    def showing(self, words: str) -> "BackgroundConfig":
+        """The same with what `words` name, "earth", "stars" or "earth,stars", in place of what it draws."""
         named = words.split(",")
         expect(set(named) <= set(WORDS), "background", f"one or more of {', '.join(WORDS)}", words)
-        return cls(earth="earth" in named, stars="stars" in named)
+        return replace(self, earth="earth" in named, stars="stars" in named)

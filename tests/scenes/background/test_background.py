@@ -300,3 +300,13 @@ def test_the_command_line_says_it(tmp_path):
     assert done.code == 0, done.errors
     assert read_png(tmp_path / "data/images/train_00000.png").shape == (16, 16, 3)
     assert call("generate", "boxsat", "--print", "--background", "moon").is_refusal("--background", "earth, stars")
+
+
+def test_the_command_line_leaves_the_rest_of_the_table_as_it_is(tmp_path):
+    path = tmp_path / "two.toml"
+    table = '[background]\nplacement = "behind"\nshare = 0.5\nstar_gain = 3.0\n'
+    path.write_text(f'[[objects]]\nspacecraft = "boxsat"\n{table}', encoding="utf-8")
+    told = BackgroundConfig(placement="behind", share=0.5, star_gain=3.0)
+    assert read_scene(path, background="earth,stars").background == told
+    assert read_scene(path, background="stars").background == replace(told, earth=False)
+    assert read_scene("boxsat", background="earth").background == BackgroundConfig(stars=False)
