@@ -140,8 +140,7 @@ class SceneConfig:
         expect(bool(self.name), "name", "a name", self.name)
         if not self.objects:
             raise InputError("objects: expected at least one object, found none")
-        fixed = self.background is not None and (self.background.placement or (self.earth and "fixed")) == "fixed"
-        if fixed and self.background is not None and self.background.share != 1:
+        if self.background is not None and self.background.share != 1 and self.background.is_fixed(self.earth):
             raise InputError("background: expected placement behind for a share of the pictures, found a fixed Earth")
         if self.background is not None and self.background.placement == "fixed" and self.earth is None:
             raise InputError("background: expected an [earth] in the scene for placement fixed, found none")

@@ -74,6 +74,7 @@ def generate(
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
             _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
+            _warn_of_another_earth(config, sweep)
             made = _make_missing(
                 writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress
             )
@@ -183,6 +184,18 @@ def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
             "depth/*.png: steps of %g m, to reach the farthest view, are coarse for %.3g m; gt/*.exr has depth in full",
             unit,
             size,
+        )
+
+
+def _warn_of_another_earth(config: SceneConfig, sweep: "_DatasetPlan") -> None:
+    """Where pictures show an Earth elsewhere than labels have theirs."""
+    background = config.background
+    if background is None or not background.earth or not background.share or background.is_fixed(config.earth):
+        return
+    if any("earth_direction" in keys for keys in sweep.keys.values()):
+        _log.warning(
+            "generate: the Earth drawn behind the objects is not that of earth_direction, which lights them or hides "
+            'the Sun; [earth] and placement = "fixed" in [background] draw that one'
         )
 
 

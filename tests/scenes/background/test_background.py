@@ -127,6 +127,22 @@ def test_a_share_of_pictures_has_no_earth_that_is_fixed():
     replace(boxsat(), background=replace(some, placement="behind"), earth=EarthConfig())
 
 
+@pytest.mark.parametrize(
+    ("background", "earth", "is_another"),
+    [
+        (BackgroundConfig(placement="behind", share=0.5), EarthConfig(), True),
+        (BackgroundConfig(), EarthConfig(), False),
+        (BackgroundConfig(placement="behind", share=0.0), EarthConfig(), False),
+        (BackgroundConfig(earth=False, placement="behind"), EarthConfig(), False),
+        (BackgroundConfig(), None, False),
+    ],
+)
+def test_an_earth_that_is_not_where_labels_say_is_noted(tmp_path, caplog, background, earth, is_another):
+    small = {"views": 1, "test_views": 0, "resolution": 8, "spp": 1}
+    generate(replace(boxsat(**small, background=background), earth=earth), tmp_path / "data")
+    assert ("the Earth drawn behind the objects is not that of earth_direction" in caplog.text) == is_another
+
+
 def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(made, tmp_path):
     generate(boxsat(background=BOTH), tmp_path / "again", workers=2)
     generate(boxsat(background=BOTH, seed=1), tmp_path / "other")
