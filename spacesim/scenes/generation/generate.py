@@ -30,7 +30,7 @@ from spacesim.scenes.config import QualityConfig, SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
 from spacesim.scenes.generation.lighting import is_sunlit, warn_of_dark_frames
-from spacesim.scenes.generation.moves import cameras_inside, poses_in
+from spacesim.scenes.generation.moves import cameras_inside, poses_in, warn_of_objects_inside
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
@@ -75,6 +75,7 @@ def generate(
             writer = _open(Path(out), described, resume, sweep)
             _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
             _warn_of_another_earth(config, sweep)
+            warn_of_objects_inside(sweep.scene, sweep.specs[0].objects)
             made = _make_missing(
                 writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress
             )
