@@ -1,21 +1,23 @@
 """How fast datasets are made, beside Mitsuba's own rendering, and whether memory stays level.
 
-    python benchmarks/dataset.py [--backend auto] [--scene boxsat] [--resolution PX] [--workers 1,4] [--views 40]
+    python benchmarks/dataset.py [--backend auto] [--scene boxsat] [--resolution PX] [--spp 64] [--workers 1,4]
+                                 [--views 40] [--json] [--markdown]
     python benchmarks/dataset.py --frames 10000       memory after 100, 1,000, ... tiny frames in one process
 
 Rows: `mi.render` of the same scene, views, samples and depth with a box filter as ours, frame by frame in turn with it;
 our radiance alone (it sums pixel by pixel in a fixed order and comes back as numpy); radiance with all labels, part of
 which are prepared while paths are traced; the labels alone; and whole frames with everything on the disk, in one
-process and in several. Start-up and compilation do not count: what is timed begins after the first frames.
+process and in several. Medians and quartiles over frames; those on the disk come in bursts, and are timed by rounds, in
+each of which every way of one process has its turn. Several processes, which take long to start, are timed once, after
+them. Start-up and compilation do not count: what is timed begins after the first frames.
 """
 
-import argparse
-import json
 import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,32 +37,37 @@ from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, cores,
 from spacesim.scenes.generation.generate import plan_views
 from spacesim.scenes.generation.workers import make_in_processes
 from spacesim.scenes.render import Renderer
-from spacesim.scenes.scene import load
+from spacesim.scenes.scene import MitsubaScene, load
 from spacesim.scenes.scenefile import read_scene
 
 WARM = 3  #: frames before the clock starts
+ROUNDS = 4  #: parts of the frames; each way has its turn in each
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--backend", choices=backend.NAMES, default="auto")
+    parser = common.arguments(__doc__)
     parser.add_argument("--scene", default="boxsat")
     parser.add_argument("--resolution", type=common.positive, help="default: 256 on LLVM, 512 on CUDA")
     parser.add_argument("--spp", type=common.positive, default=64)
     parser.add_argument("--views", type=common.positive, default=40, help="frames of each measurement (40)")
     parser.add_argument("--workers", type=counts, default=[1], help="numbers of processes, as 1,2,4 (1)")
     parser.add_argument("--frames", type=common.positive, help="measure memory over so many tiny frames instead")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     name = backend.select(options.backend)
     keep_freed_memory()  # as the command does
     if options.frames:
-        report: dict[str, Any] = {"backend": name, "memory": memory(options.scene, options.frames)}
-    else:
-        size = options.resolution or {"llvm": 256, "cuda": 512}[name]
-        report = {"backend": name, "cores": cores(), "scene": options.scene, "pixels": size, "spp": options.spp}
-        report |= speed(options.scene, size, options.spp, options.views, options.workers)
-    print(json.dumps(report, indent=1) if options.json else describe(report))
+        rows = memory(options.scene, options.frames)
+        return common.emit({"memory": rows}, {"Resident memory": rows}, options)
+    size = options.resolution or {"llvm": 256, "cuda": 512}[name]
+    found = speed(options.scene, size, options.spp, options.views, options.workers)
+    written, labels = (f"{found[name]:.0%}" for name in ("written_to_raw", "labels_to_radiance"))
+    ratios = [
+        {"ratio": "written, of mi.render's speed", "found": written, "asked": "at least 70% (CPU)"},
+        {"ratio": "labels, of radiance's time", "found": labels, "asked": "at most 15%"},
+    ]
+    report = {"cores": cores(), "scene": options.scene, "pixels": size, "spp": options.spp, **found}
+    title = f"{options.scene}, {size} x {size} pixels, {options.spp} samples, {cores()} cores: median (quartiles)"
+    common.emit(report, {title: found["rows"], "Ratios": ratios}, options)
 
 
 def counts(text: str) -> list[int]:
@@ -80,37 +87,59 @@ def planned(scene: str, **changes: Any) -> tuple[Renderer, Job, list[FrameSpec]]
 
 def speed(scene: str, size: int, spp: int, views: int, workers: list[int]) -> dict[str, Any]:
     """Milliseconds a frame of each way of rendering, and the ratios that are evaluated."""
-    renderer, job, shots = planned(scene, views=views + WARM, resolution=(size, size), spp=spp)
-    shots, loaded = shots[: views + WARM], load(job.scene)
+    rounds = min(ROUNDS, views)
+    count = views + 2 * WARM * rounds
+    renderer, job, shots = planned(scene, views=count, resolution=(size, size), spp=spp)
+    counted, around, loaded = shots[:views], iter(shots[views:count]), load(job.scene)
+    first = list(islice(around, WARM))
+    seconds = dict[str, list[float]]()
+    written, raw = list[float](), list[float]()  # of each round, seconds a frame
+    with tempfile.TemporaryDirectory() as folder:
+        maker = FrameMaker(replace(job, root=Path(folder)), renderer)
+        for shot in first:
+            common.seconds(ways(shot, renderer, loaded, job), 1, warm_up=0)
+        for k in range(rounds):
+            own = counted[k::rounds]
+            found = [common.seconds(ways(shot, renderer, loaded, job), 1, warm_up=0) for shot in own]
+            for way in found[0]:
+                seconds.setdefault(way, []).extend(frame[way][0] for frame in found)
+            raw.append(float(np.mean([frame["mi.render"] for frame in found])))
+            if 1 in workers:
+                before, after = list(islice(around, WARM)) if k else first, list(islice(around, WARM))
+                written.append(seconds_a_frame(maker.make([*before, *own, *after]), WARM, WARM))
+    timings = {way: common.Timing.of(values) for way, values in seconds.items()}
+    rows = [{"way": way, "ms a frame": timing, "frames/s": 1e3 / timing.median} for way, timing in timings.items()]
+    shares = []
+    if written:
+        timing = common.Timing.of(written)
+        rows.append({"way": "written", "ms a frame": timing, "frames/s": 1e3 / timing.median})
+        shares.append(np.median(np.divide(raw, written)))
+    for processes in filter(lambda number: number > 1, workers):
+        with tempfile.TemporaryDirectory() as folder:
+            made = make_in_processes(replace(job, root=Path(folder)), first + counted, processes)
+            taken = seconds_a_frame(made, 4 * processes)
+        rows.append({"way": f"written, {processes} processes", "ms a frame": 1e3 * taken, "frames/s": 1 / taken})
+        shares.append(np.mean(raw) / taken)
+    labels = timings["radiance and labels"].median / timings["radiance"].median - 1
+    return {"rows": rows, "written_to_raw": float(max(shares)), "labels_to_radiance": labels}
+
+
+def ways(shot: FrameSpec, renderer: Renderer, loaded: MitsubaScene, job: Job) -> dict[str, common.Work]:
+    """What renders a frame in one way and another; `loaded` is where the frame has the Sun."""
     mi = backend.mitsuba()
     integrator = mi.load_dict({"type": "path", "max_depth": job.quality.max_depth, "hide_emitters": True})
-    times: dict[str, list[float]] = {"mi.render": [], "radiance": [], "radiance and labels": [], "labels": []}
-    for shot in shots:
-        view, what = sensor(shot.camera, loaded.units), (shot.camera, shot.sun)
-        loaded.point(shot.sun)
+    view, what, seed = sensor(shot.camera, loaded.units), (shot.camera, shot.sun), (job.seed, shot.index)
+    loaded.point(shot.sun)
 
-        def raw(view: Any = view, seed: int = shot.index) -> None:
-            for source in filter(None, (loaded.sunlit, loaded.earthlit)):
-                dr.eval(mi.render(source, sensor=view, integrator=integrator, spp=spp, seed=seed))
+    def raw() -> None:
+        for source in filter(None, (loaded.sunlit, loaded.earthlit)):
+            dr.eval(mi.render(source, sensor=view, integrator=integrator, spp=job.quality.spp, seed=shot.index))
 
-        seed = job.seed, shot.index
-        times["mi.render"].append(milliseconds(raw))
-        times["radiance"].append(milliseconds(partial(renderer.radiance, *what, seed)))
-        times["radiance and labels"].append(milliseconds(partial(renderer.render, *what, seed)))
-        times["labels"].append(milliseconds(partial(renderer.labels, *what)))
-    mean = {key: float(np.mean(values[WARM:])) for key, values in times.items()}
-    for count in workers:
-        with tempfile.TemporaryDirectory() as folder:
-            job = replace(job, root=Path(folder))
-            made = FrameMaker(job, renderer).make(shots) if count == 1 else make_in_processes(job, shots, count)
-            key = "written" if count == 1 else f"written, {count} processes"
-            mean[key] = milliseconds_a_frame(made, WARM if count == 1 else 4 * count)
-    written = min(value for key, value in mean.items() if key.startswith("written"))
     return {
-        "milliseconds": mean,
-        "frames_per_second": {key: 1e3 / value for key, value in mean.items()},
-        "written_to_raw": mean["mi.render"] / written,
-        "labels_to_radiance": mean["radiance and labels"] / mean["radiance"] - 1,
+        "mi.render": raw,
+        "radiance": partial(renderer.radiance, *what, seed),
+        "radiance and labels": partial(renderer.render, *what, seed),
+        "labels": partial(renderer.labels, *what),
     }
 
 
@@ -125,20 +154,13 @@ def sensor(camera: Camera, units: Units) -> Any:
     return mi.load_dict({"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": pose, "film": film})
 
 
-def milliseconds(work: Any) -> float:
-    dr.sync_thread()
-    start = time.perf_counter()
-    work()
-    dr.sync_thread()
-    return 1e3 * (time.perf_counter() - start)
-
-
-def milliseconds_a_frame(frames: Iterator[WrittenFrame], skipped: int) -> float:
-    """Of frames as they come, without the first ones."""
+def seconds_a_frame(frames: Iterator[WrittenFrame], before: int, after: int = 0) -> float:
+    """Of frames as they come, without so many before and after those that count: the last ones come sooner."""
     moments = [time.perf_counter() for _ in frames]
-    if len(moments) <= skipped + 1:
-        raise InputError(f"--views: expected at least {skipped + 2 - WARM} with so many processes")
-    return 1e3 * (moments[-1] - moments[skipped]) / (len(moments) - 1 - skipped)
+    counted = len(moments) - before - after
+    if counted < 1:
+        raise InputError(f"--views: expected at least {before + 1 - WARM} with so many processes")
+    return (moments[before + counted - 1] - moments[before - 1]) / counted
 
 
 def memory(scene: str, frames: int) -> list[dict[str, float]]:
@@ -153,22 +175,6 @@ def memory(scene: str, frames: int) -> list[dict[str, float]]:
             if done in marks:
                 rows.append({"frames": done, "MB": common.resident() / 1e6, "seconds": time.perf_counter() - start})
     return rows
-
-
-def describe(report: dict[str, Any]) -> str:
-    """As a table."""
-    if "memory" in report:
-        rows = [f"{row['frames']:>8}{row['MB']:>12.1f}{row['seconds']:>10.1f}" for row in report["memory"]]
-        return "\n".join([f"{'frames':>8}{'memory, MB':>12}{'seconds':>10}", *rows])
-    head = (
-        f"{report['scene']}, {report['pixels']} px, {report['spp']} spp, {report['backend']}, {report['cores']} cores"
-    )
-    lines = [head, f"{'':<24}{'ms a frame':>12}{'frames/s':>10}"]
-    for key, value in report["milliseconds"].items():
-        lines.append(f"{key:<24}{value:>12.2f}{1e3 / value:>10.1f}")
-    lines.append(f"written, of mi.render's speed: {report['written_to_raw']:.0%} (CPU: at least 70%)")
-    lines.append(f"what the labels add to the radiance's time: {report['labels_to_radiance']:.0%} (at most 15%)")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

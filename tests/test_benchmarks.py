@@ -548,19 +548,37 @@ def test_composition_tells_both_tables(command, tiny_run, small_pair, place):
     assert "PAIR" in command or len(read_dataset(place / "RUNS/pair").test) == 2
 
 
-@smallest("dataset.py --backend llvm --resolution 16 --spp 1 --views 7 --workers 1,2 --json")
-def test_dataset_tells_ways_and_ratios(command):
+DATASET = "dataset.py --backend llvm --resolution 16 --spp 1"
+
+
+@smallest(f"{DATASET} --views 7 --workers 1,2 --markdown --json found.json")
+def test_dataset_tells_ways_and_ratios(command, place):
     start = time.monotonic()
-    report = json.loads(call(command, ended_alone))
+    output = call(command, ended_alone)
     lasted = 1e3 * (time.monotonic() - start)
-    ways, found = ["mi.render", "radiance", "radiance and labels", "labels", "written"], report["milliseconds"]
-    assert list(found) == [*ways, "written, 2 processes"]
-    assert all(value > 0 for value in found.values())
-    assert 7 * sum(found[way] for way in ways) < lasted
-    assert report["frames_per_second"] == pytest.approx({way: 1e3 / value for way, value in found.items()})
-    fastest = min(found["written"], found["written, 2 processes"])
-    assert report["written_to_raw"] == pytest.approx(found["mi.render"] / fastest)
-    assert report["labels_to_radiance"] == pytest.approx(found["radiance and labels"] / found["radiance"] - 1)
+    report = json.loads((place / "found.json").read_text())
+    assert report["machine"]["backend"] == "llvm"
+    rows = {row["way"]: row for row in report["rows"]}
+    ways = ["mi.render", "radiance", "radiance and labels", "labels", "written"]
+    assert list(rows) == [*ways, "written, 2 processes"]
+    found = {way: rows[way]["ms a frame"] for way in ways}
+    for way, timing in found.items():
+        assert 0 < timing["least"] <= timing["low"] <= timing["median"] <= timing["high"], way
+        assert rows[way]["frames/s"] == pytest.approx(1e3 / timing["median"])
+        assert re.search(rf"\| +{way} \| +[\d.]+ \([\d.]+ to [\d.]+\) \|", output)
+    assert 7 * sum(timing["least"] for timing in found.values()) < lasted
+    assert found["written"]["low"] < found["written"]["high"]  # of several rounds
+    assert rows["written, 2 processes"]["ms a frame"] > 0
+    assert report["written_to_raw"] > 0
+    labels = found["radiance and labels"]["median"] / found["radiance"]["median"] - 1
+    assert report["labels_to_radiance"] == pytest.approx(labels)
+
+
+@smallest(f"{DATASET} --views 1 --json")
+def test_dataset_tells_of_one_frame(command):
+    report = json.loads(call(command, ended_alone))
+    raw, written = (report["rows"][row]["ms a frame"]["median"] for row in (0, -1))
+    assert report["written_to_raw"] == pytest.approx(raw / written)  # of the same round
 
 
 @smallest("dataset.py --backend llvm --frames 20 --json")
@@ -592,14 +610,15 @@ def test_dataset_measures_the_same_pictures():
 def test_frames_count_from_when_the_kernels_are_there():
     import dataset
 
-    def names():
-        for seconds in (0.2, 0.2, 0.02, 0.02, 0.02):
-            time.sleep(seconds)
+    def names(*pauses: float):
+        for pause in pauses:
+            time.sleep(pause)
             yield "name"
 
-    assert dataset.milliseconds_a_frame(names(), skipped=1) == pytest.approx(20, rel=0.6)
+    assert dataset.seconds_a_frame(names(0.2, 0.2, 0.02, 0.02, 0.02), 2) == pytest.approx(0.02, rel=0.6)
+    assert dataset.seconds_a_frame(names(0.2, 0.02, 0.02, 0.2, 0.2), 1, after=2) == pytest.approx(0.02, rel=0.6)
     with pytest.raises(InputError, match="--views: expected at least 2 with"):
-        dataset.milliseconds_a_frame(iter("abcd"), skipped=3)
+        dataset.seconds_a_frame(iter("abcd"), before=4)
 
 
 @smallest(

@@ -140,8 +140,7 @@ class SceneConfig:
         expect(bool(self.name), "name", "a name", self.name)
         if not self.objects:
             raise InputError("objects: expected at least one object, found none")
-        fixed = self.background is not None and (self.background.placement or (self.earth and "fixed")) == "fixed"
-        if fixed and self.background is not None and self.background.share != 1:
+        if self.background is not None and self.background.share != 1 and self.background.is_fixed(self.earth):
             raise InputError("background: expected placement behind for a share of the pictures, found a fixed Earth")
         if self.background is not None and self.background.placement == "fixed" and self.earth is None:
             raise InputError("background: expected an [earth] in the scene for placement fixed, found none")
@@ -165,7 +164,7 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     nothing. `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
     `resolution` may be one number, of a square, and `sun` one (azimuth, elevation). `sun` takes the place of the rig's
     own arrangement, whatever the number of its Suns, and `suns` alone that of `sun`. `background` is a
-    `BackgroundConfig` or the words of one.
+    `BackgroundConfig`, or words that say what the scene's own draws.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
@@ -197,8 +196,8 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
             rig.setdefault("suns", len(rig["sun"]))
     elif "suns" in rig:
         rig["sun"] = ()
-    if isinstance(changes[""].get("background"), str):
-        changes[""]["background"] = BackgroundConfig.of(changes[""]["background"])
+    if isinstance(words := changes[""].get("background"), str):
+        changes[""]["background"] = (scene.background or BackgroundConfig()).showing(words)
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)
 

@@ -34,7 +34,7 @@ class Background:
     def __init__(self, config: BackgroundConfig, scene: Scene, distortion: tuple[float, ...], seed: int) -> None:
         self._config, self._seed, self._distortion = config, seed, distortion
         self._earth, self._target = scene.earth or EarthConfig(), scene.bounding_sphere[0]
-        self._fixed = (config.placement or ("fixed" if scene.earth else "behind")) == "fixed"
+        self._fixed = config.is_fixed(scene.earth)
         self._stars = Stars(_number(seed, _SKY)) if config.stars else None
         self._globe = None
         if config.earth:

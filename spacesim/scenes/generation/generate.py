@@ -30,7 +30,7 @@ from spacesim.scenes.config import QualityConfig, SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
 from spacesim.scenes.generation.frames import FrameMaker, FrameSpec, Job, raw_suffixes, versions, writing_threads
 from spacesim.scenes.generation.lighting import is_sunlit, warn_of_dark_frames
-from spacesim.scenes.generation.moves import cameras_inside, poses_in
+from spacesim.scenes.generation.moves import cameras_inside, poses_in, warn_of_objects_inside
 from spacesim.scenes.generation.overview import write_overview
 from spacesim.scenes.generation.points import sample_surface_points
 from spacesim.scenes.lights.earth import EARTH_RADIUS_KM, EarthConfig
@@ -74,6 +74,8 @@ def generate(
             alone.enter_context(lock_folder(job.root))
             writer = _open(Path(out), described, resume, sweep)
             _warn_of_coarse_depth(writer.depth_unit, sweep.scene)
+            _warn_of_another_earth(config, sweep)
+            warn_of_objects_inside(sweep.scene, sweep.specs[0].objects)
             made = _make_missing(
                 writer, sweep.specs, lambda left: _make_frames(make, job, left, sweep.renderer), progress
             )
@@ -183,6 +185,18 @@ def _warn_of_coarse_depth(unit: float, scene: Scene) -> None:
             "depth/*.png: steps of %g m, to reach the farthest view, are coarse for %.3g m; gt/*.exr has depth in full",
             unit,
             size,
+        )
+
+
+def _warn_of_another_earth(config: SceneConfig, sweep: "_DatasetPlan") -> None:
+    """Where pictures show an Earth elsewhere than labels have theirs."""
+    background = config.background
+    if background is None or not background.earth or not background.share or background.is_fixed(config.earth):
+        return
+    if any("earth_direction" in keys for keys in sweep.keys.values()):
+        _log.warning(
+            "generate: the Earth drawn behind the objects is not that of earth_direction, which lights them or hides "
+            'the Sun; [earth] and placement = "fixed" in [background] draw that one'
         )
 
 

@@ -1,6 +1,7 @@
 """Objects that move within a dataset: the scene as one of its frames has it."""
 
 import gc
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,6 +14,11 @@ from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 
 Poses = Mapping[int, Array]  #: rigid world_from_object [4, 4] of those that move, by number
+
+ASKED = 256
+"""Vertices of an object, about, of which each is asked whether it lies within another object."""
+
+_log = logging.getLogger(__name__)
 
 
 def poses_in(scene: Scene, moves: Poses) -> list[Array]:
@@ -75,6 +81,26 @@ def cameras_inside(scene: Scene, renderer: Renderer, positions: Array, moves: Se
             alone = Renderer(replace(scene, objects=objects, earth=None), 1)
             inside |= alone.inside(seen)
     return inside
+
+
+def warn_of_objects_inside(scene: Scene, moves: Poses) -> None:
+    """Log one warning that names the objects of which most lies within parts of another, where a frame moves some by
+    `moves`. Parts may overlap by design: it is no error."""
+    scene = moved(scene, moves)
+    names = [f"object {k} ({item.spacecraft.name})" for k, item in enumerate(scene.objects, start=1)]
+    points = [np.asarray(replace(scene, objects=(item,)).mesh.vertices) for item in scene.objects]
+    some = [every[:: max(1, len(every) // ASKED)] for every in points]
+    found = []
+    for outer, item in enumerate(scene.objects):
+        least, most = points[outer].min(axis=0), points[outer].max(axis=0)
+        others = [k for k in range(len(some)) if k != outer]
+        near = [k for k in others if np.mean(((some[k] > least) & (some[k] < most)).all(axis=1)) > 0.5]
+        if near:
+            alone = Renderer(replace(scene, objects=(item,), earth=None), 1)
+            inside = [k for k in near if alone.inside(some[k]).mean() > 0.5]
+            found += [f"most of {names[k]} lies within {names[outer]}" for k in inside]
+    if found:
+        _log.warning("generate: %s%s", "; ".join(found), " in the first frame" if moves else "")
 
 
 def _as_placed(scene: Scene, number: int, pose: Array) -> Array:

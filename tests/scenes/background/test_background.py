@@ -127,6 +127,22 @@ def test_a_share_of_pictures_has_no_earth_that_is_fixed():
     replace(boxsat(), background=replace(some, placement="behind"), earth=EarthConfig())
 
 
+@pytest.mark.parametrize(
+    ("background", "earth", "is_another"),
+    [
+        (BackgroundConfig(placement="behind", share=0.5), EarthConfig(), True),
+        (BackgroundConfig(), EarthConfig(), False),
+        (BackgroundConfig(placement="behind", share=0.0), EarthConfig(), False),
+        (BackgroundConfig(earth=False, placement="behind"), EarthConfig(), False),
+        (BackgroundConfig(), None, False),
+    ],
+)
+def test_an_earth_that_is_not_where_labels_say_is_noted(tmp_path, caplog, background, earth, is_another):
+    small = {"views": 1, "test_views": 0, "resolution": 8, "spp": 1}
+    generate(replace(boxsat(**small, background=background), earth=earth), tmp_path / "data")
+    assert ("the Earth drawn behind the objects is not that of earth_direction" in caplog.text) == is_another
+
+
 def test_same_seed_gives_the_same_bytes_in_any_number_of_processes(made, tmp_path):
     generate(boxsat(background=BOTH), tmp_path / "again", workers=2)
     generate(boxsat(background=BOTH, seed=1), tmp_path / "other")
@@ -300,3 +316,13 @@ def test_the_command_line_says_it(tmp_path):
     assert done.code == 0, done.errors
     assert read_png(tmp_path / "data/images/train_00000.png").shape == (16, 16, 3)
     assert call("generate", "boxsat", "--print", "--background", "moon").is_refusal("--background", "earth, stars")
+
+
+def test_the_command_line_leaves_the_rest_of_the_table_as_it_is(tmp_path):
+    path = tmp_path / "two.toml"
+    table = '[background]\nplacement = "behind"\nshare = 0.5\nstar_gain = 3.0\n'
+    path.write_text(f'[[objects]]\nspacecraft = "boxsat"\n{table}', encoding="utf-8")
+    told = BackgroundConfig(placement="behind", share=0.5, star_gain=3.0)
+    assert read_scene(path, background="earth,stars").background == told
+    assert read_scene(path, background="stars").background == replace(told, earth=False)
+    assert read_scene("boxsat", background="earth").background == BackgroundConfig(stars=False)

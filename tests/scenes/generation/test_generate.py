@@ -18,8 +18,10 @@ from spacesim.data.store import FrameWriter, find_unreadable_files, load_depth, 
 from spacesim.scenes.build import build
 from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.cameras.sphere_rigs import RandomRig
+from spacesim.scenes.config import ObjectConfig
 from spacesim.scenes.generation.generate import _DatasetPlan, estimate, generate, generate_part
 from spacesim.scenes.generation.lighting import is_sunlit
+from spacesim.scenes.generation.moves import warn_of_objects_inside
 from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.trajectory.rig import PoseRig
 
@@ -176,6 +178,24 @@ def test_far_views_have_depth_too(tmp_path, caplog):
     very_far = read_scene("boxsat", views=1, test_views=0, resolution=8, spp=1, distance=4e5, fov_deg=0.001, points=1)
     assert generate(very_far, tmp_path / "very-far").depth_unit == 10
     assert len([record for record in caplog.records if "are coarse for" in record.getMessage()]) == 1
+
+
+def test_an_object_within_another_is_noted(tmp_path, caplog):
+    small = {"views": 1, "test_views": 0, "resolution": 8, "spp": 1, "points": 20}
+    around = boxsat(**small)
+    within = replace(around, objects=(ObjectConfig("cubesat"), *around.objects))
+    generate(within, tmp_path / "within")
+    assert caplog.messages == ["generate: most of object 1 (cubesat) lies within object 2 (boxsat)"]
+    caplog.clear()
+    out, beside = np.eye(4), np.eye(4)
+    out[0, 3], beside[0, 3] = 0.8, 5.0  # metres: its larger part sticks out; they do not touch
+    scene = build(replace(around, objects=(*around.objects, ObjectConfig("cubesat", position=(5.0, 0.0, 0.0)))))
+    for pose in (out, beside):
+        warn_of_objects_inside(scene, {2: pose})
+    warn_of_objects_inside(scene, {})
+    assert not caplog.messages
+    warn_of_objects_inside(scene, {2: np.eye(4)})
+    assert caplog.messages == ["generate: most of object 2 (cubesat) lies within object 1 (boxsat) in the first frame"]
 
 
 def test_keypoints_lie_beside_the_mesh(made):
