@@ -41,7 +41,7 @@ class Counted(TrainingPairs):
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "sizes", "repeats")
     parser.add_argument("--methods", default="vanilla", help=f"of {', '.join(METHODS)}")
     parser.add_argument("--preset", default="thesis", help="whose networks and light images (default thesis)")
     options = parser.parse_args()

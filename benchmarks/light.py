@@ -5,7 +5,8 @@
 The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
 long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left
 on the device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture, both
-differences of medians, which a host that drifts may push below 0; "kernels" is what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
+differences of medians, which a host that drifts may push below 0; "kernels" is what the device alone needs. The
+thesis's frames (RTX 5000 Ada) stand beside ours.
 """
 
 import sys
@@ -66,7 +67,7 @@ class Frame:
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "sizes", "repeats")
     parser.add_argument("--methods", default="relight,shadow-map,shadow-splat", help=f"of {', '.join(LIT)}")
     parser.add_argument("--preset", default="thesis", help="whose networks and light images (default thesis)")
     parser.add_argument("--step-sizes", metavar="SIZES", help="of the training steps; 'none' leaves them out")

@@ -46,7 +46,7 @@ MODELS = 1, 3  #: of a frame
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "repeats")
     parser.add_argument("--out", type=Path, required=True, help="where data and runs are, or are made")
     parser.add_argument("--data", type=Path, help="a dataset in place of its own")
     parser.add_argument("--preset", default="thesis")

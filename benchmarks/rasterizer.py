@@ -34,7 +34,7 @@ SIZES = {"cuda": "31622x1024,101958x1024,165495x1024,1000000x1024", "llvm": "100
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "sizes", "repeats")
     add_peers_option(parser)
     parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg", help="draw time against pairs")

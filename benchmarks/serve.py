@@ -35,7 +35,7 @@ PATIENCE = 120_000  #: milliseconds
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "repeats")
     parser.add_argument("path", nargs="?", metavar="RUN|SCENE.toml")
     parser.add_argument("--gaussians", type=common.positive, default=15_000, help="of the sphere (15000)")
     parser.add_argument("--side", type=common.positive, default=512, help="pixels of the pictures (512)")

@@ -39,7 +39,7 @@ MODES: tuple[dict[str, Any], ...] = (
 
 def main() -> None:
     """Measure each size and print a table."""
-    parser = common.arguments(__doc__, "31622x512,101958x512")
+    parser = common.arguments(__doc__, "sizes", "repeats", sizes="31622x512,101958x512")
     parser.add_argument("--peers", choices=["gsplat"], help="measured beside ours; needs CUDA and gsplat")
     parser.add_argument("--store", type=Path, metavar="FILE.npz", help="write the peer's pictures and gradients")
     options = parser.parse_args()

@@ -43,7 +43,7 @@ RATES = dict.fromkeys(("means", "log_scales", "quaternions", "logit_opacities", 
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "sizes", "repeats")
     add_peers_option(parser)
     parser.add_argument("--opensplat", type=Path, metavar="PATH", help="OpenSplat's binary, run on the CPU")
     parser.add_argument("--growth", action="store_true", help="sizes that show how the time grows")

@@ -49,7 +49,7 @@ PATIENCE = 90.0  #: seconds that clients may take beyond their time
 
 
 def main() -> None:
-    parser = common.arguments(__doc__)
+    parser = common.arguments(__doc__, "repeats")
     parser.add_argument("path", type=Path, nargs="?", metavar="RUN|SCENE.toml")
     parser.add_argument("--gaussians", type=int, default=30_000, help="of the sphere (30000)")
     parser.add_argument("--side", type=int, default=512, help="pixels of the picture (512)")

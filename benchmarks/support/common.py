@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import numpy as np
@@ -65,12 +65,17 @@ class Timing:
         return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f})"
 
 
-def arguments(text: str | None, sizes: str | None = None) -> argparse.ArgumentParser:
-    """A parser with the options that every benchmark has. text: the script's docstring."""
+def arguments(
+    text: str | None, *more: Literal["sizes", "repeats"], sizes: str | None = None
+) -> argparse.ArgumentParser:
+    """A parser with the options that every benchmark has, and `more` that several have. text: the script's docstring;
+    sizes: the default"""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", choices=backend.NAMES, default="auto")
-    parser.add_argument("--sizes", default=sizes, help="GAUSSIANSxPIXELS,... (pictures are square)")
-    parser.add_argument("--repeats", type=positive, default=30, help="timed calls of each (default 30)")
+    if "sizes" in more:
+        parser.add_argument("--sizes", default=sizes, help="GAUSSIANSxPIXELS,... (pictures are square)")
+    if "repeats" in more:
+        parser.add_argument("--repeats", type=positive, default=30, help="timed calls of each (default 30)")
     parser.add_argument("--json", nargs="?", const=Path("-"), type=Path, metavar="FILE", help="to FILE or the screen")
     parser.add_argument("--markdown", action="store_true", help="tables in Markdown")
     return parser
