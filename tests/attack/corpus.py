@@ -123,7 +123,7 @@ KINDS = (
     ),
     Kind(
         "config.json", ("run/config.json",), (m.of_json, m.of_json, m.of_json, m.of_bytes, m.other_file),
-        _words(_LOOK, _LOOK, _LOOK, _LOOK, "export run --ply {out} --sun 1,2",
+        _words(_LOOK, _LOOK, _LOOK, _LOOK, "export run --ply {out}.ply --sun 1,2",
                "eval run --data data --out {out} --no-geometry"),
     ),
     Kind(
@@ -134,7 +134,7 @@ KINDS = (
         "model", ("run/model.safetensors", "plain/model.safetensors"),
         (m.of_safetensors, m.of_safetensors, m.of_bytes, m.of_floats, m.other_file),
         _words(_LOOK, _LOOK, "render plain --camera camera.json --out {out}.png",
-               "export plain --ply {out}", "eval run --data data --out {out} --no-geometry"),
+               "export plain --ply {out}.ply", "eval run --data data --out {out} --no-geometry"),
     ),
     Kind(
         "checkpoint",
@@ -245,7 +245,7 @@ _LINES = (
     ("compose composed.toml --out {out}", ("--size", "--exposure", "--ply")),
     ("eval run --data data --out {out} --no-geometry", ("--split", "--lpips-weights", "--json")),
     ("report eval --out {out}.html", ("eval2", "data", "run")),
-    ("export run --ply {out} --sun 1,2", ("--sun", "--object", "--data", "--views", "--voxel", "--truncation")),
+    ("export run --ply {out}.ply --sun 1,2", ("--sun", "--object", "--data", "--views", "--voxel", "--truncation")),
     ("export run --glb {out}.glb --sun 1,2", ("--up", "--scale", "--recentre", "--spz-version", "--spz", "--usd")),
     ("export run --mesh {out}.ply", ("--views", "--voxel", "--truncation", "--sun", "--data", "--mesh")),
     ("export data --speedplus {out}", ("--object", "--bop", "--sun")),
