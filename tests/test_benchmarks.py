@@ -259,6 +259,8 @@ def test_a_peers_kernels_and_ours_are_by_one_profiler():
     peer = {"clock": {"frame": Timing.of([4e-3])}, "kernels": {"frame": 2.0}, "our kernels": {"frame": 1.0}}
     ours = {"gaussians": 7, "pixels": 8, "clock": clock, "kernels": {"frame": 9.0}, "peers": {"other": peer}}
     peer["ratios"] = rasterizer.ratios(ours, peer)
+    peer["apart"] = rasterizer.apart(np.zeros((3, 2, 2)), np.full((3, 2, 2), 2e-4))
+    assert rasterizer.peer_row(ours, "other")["pictures apart (99.9 %)"] == "0.0002"
     assert peer["ratios"] == pytest.approx({"frame, clock": 0.75, "frame, kernels": 0.5})
     assert rasterizer.peer_row(ours, "other")["frame, kernels"] == "1.00 / 2.00"
     unseen = {**peer, "our kernels": {"frame": None}}

@@ -37,7 +37,8 @@ def test_a_device_is_written_into_and_stays_one(tmp_path):
 @pytest.mark.parametrize("arguments", [("export", "{run}", "--ply", "{out}"), ("report", "{eval}", "--out", "{out}")])
 @pytest.mark.parametrize("kind", ["null", "link"])
 def test_commands_leave_devices_and_links_in_place(spacesim, tiny_run, tiny_eval, tmp_path, arguments, kind):
-    out = device(tmp_path / "null", 3) if kind == "null" else tmp_path / "link"
+    link = tmp_path / ("link.ply" if "--ply" in arguments else "link.html")
+    out = device(tmp_path / "null", 3) if kind == "null" else link
     if kind == "link":
         (tmp_path / "there").write_bytes(b"old")
         out.symlink_to("there")

@@ -43,9 +43,11 @@ _SAME = {"report": "report.html", "camera density": "camera_density.png"}
 
 def check_output(path: Path, kind: str) -> None:
     """Raise InputError where a file of one of the kinds of `SUFFIXES` is to be written to a name of another suffix, to
-    a folder, or in the place of a file of a dataset, a run or an evaluation."""
+    a folder, or in the place of a file of a dataset, a run or an evaluation. A device may have any name."""
     if path.is_dir():
         raise InputError(f"{path}: expected a file to write, found a folder")
+    if path.exists() and not path.is_file():
+        return
     suffixes = SUFFIXES[kind]
     if path.suffix.lower() not in suffixes:
         expected = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
