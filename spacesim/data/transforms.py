@@ -351,19 +351,14 @@ def _read_sun(values: Json) -> Sun | None:
 
 
 def _read_direction(values: Json) -> Sun | None:
-    named = None
+    if "sun_direction" in values:
+        try:
+            return Sun(np.asarray(values["sun_direction"], np.float64))
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
     if "sun_azimuth_deg" in values and "sun_elevation_deg" in values:
-        named = Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
-    if "sun_direction" not in values:
-        return named
-    try:
-        sun = Sun(np.asarray(values["sun_direction"], np.float64))
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"expected {SUN_WORDS}, as sun_direction, found other values") from None
-    if named and sun.direction @ named.direction < math.cos(math.radians(1)):
-        angles = " and ".join(f"{angle:.1f}" for angle in sun.angles)
-        raise InputError(f"expected sun_azimuth_deg and sun_elevation_deg of its sun_direction, {angles}, found others")
-    return sun
+        return Sun.from_angles(_number(values, "sun_azimuth_deg"), _number(values, "sun_elevation_deg"))
+    return None
 
 
 def _read_earth(values: Json) -> Earth | None:

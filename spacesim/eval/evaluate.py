@@ -22,6 +22,7 @@ from spacesim.data.files import JsonDict, remove_leftovers, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
 from spacesim.data.integrity.outputs import check_evaluation_folder, clear_evaluation
+from spacesim.data.integrity.whole import check_pictures
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.transforms import check_still
 from spacesim.eval.align import align, as_trained
@@ -98,8 +99,8 @@ def evaluate(
     What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and scored on the
     other.
     progress: called with (frames done, frames in all, the next one's file) before each frame and at the end.
-    Raises InputError where there is no frame to evaluate, the dataset is broken or `out` holds other files, WorkError
-    where a prediction is not finite.
+    Raises InputError where there is no frame to evaluate, the dataset is broken or `out` holds another's report,
+    WorkError where a prediction is not finite.
     """
     config, dataset = config or EvaluateConfig(), check_still(dataset)
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
@@ -119,6 +120,7 @@ def evaluate(
             f"{dataset.root}: expected the Sun of every frame for a relightable run, {dark.file_path} has none"
         )
     network, lpips_sentence = lpips.load(config.lpips_weights)
+    check_pictures(dataset, frames)
     _prepare(out)
     if dark is None or not run.relightable:
         run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels

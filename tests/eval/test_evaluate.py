@@ -1,6 +1,7 @@
 """A run evaluated end to end on a tiny dataset."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,18 +173,45 @@ def test_nothing_of_an_earlier_evaluation_stays_but_what_is_not_its_own(make_run
 
 
 @pytest.mark.parametrize(
-    "files", [{"report.html": "mine", "metrics.json": "{}"}, {"report.html": "mine"}, {"frames/0/note.txt": "mine"}]
+    "files", [{"report.html": "mine", "metrics.json": "{}"}, {"report.html": "mine", "frames/0/note.txt": "mine"}]
 )
-def test_a_folder_with_other_files_is_refused_and_left_alone(make_run, dataset, tmp_path, files):
+def test_a_folder_with_another_report_is_refused_and_left_alone(make_run, dataset, tmp_path, files):
     out = tmp_path / "eval"
     for name, text in files.items():
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text(text)
-    with pytest.raises(
-        InputError, match="eval: expected an empty or new folder, or one of an earlier evaluation, found"
-    ):
+    with pytest.raises(InputError, match="eval: expected a new folder, or one of an earlier evaluation, found another"):
         evaluate(make_run(shifted), dataset, out)
     assert {str(path.relative_to(out)): path.read_text() for path in out.rglob("*.*")} == files
+
+
+def test_an_evaluation_that_was_interrupted_is_done_again_beside_notes(make_run, dataset, tmp_path):
+    out = tmp_path / "eval"
+    out.mkdir()
+    (out / "log.txt").write_text("mine")
+    evaluate(make_run(shifted), dataset, out)
+
+    def stop(done: int, _all: int, _file: str) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(make_run(shifted), dataset, out, progress=stop)
+    assert not (out / "metrics.json").exists()
+    evaluate(make_run(shifted), dataset, out)
+    assert (out / "metrics.json").exists()
+    assert (out / "log.txt").read_text() == "mine"
+
+
+def test_a_broken_picture_is_found_before_an_earlier_evaluation_goes(make_run, dataset, tmp_path):
+    out, copied = tmp_path / "eval", replace(dataset, root=Path(shutil.copytree(dataset.root, tmp_path / "copy")))
+    evaluate(make_run(shifted), copied, out)
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
+    picture = copied.root / copied.test[-1].file_path
+    picture.write_bytes(picture.read_bytes()[:-20])
+    with pytest.raises(InputError, match=picture.name):
+        evaluate(make_run(shifted), copied, out)
+    assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
 
 
 def test_same_run_same_bytes(make_run, dataset, tmp_path):

@@ -34,7 +34,6 @@ _PICTURES = (
     r"|geometry/((truth|reconstruction)_\d+\.png|reconstruction\.ply)"
 )
 _EVALUATION = re.compile(rf"metrics\.json|report\.html|{_PICTURES}")
-_UNFINISHED = re.compile(_PICTURES)
 _SWEEP = re.compile(r"sweep\.(png|mp4)|frames/\d{4}\.(png|exr)")
 
 _SAME = {"report": "report.html", "camera density": "camera_density.png"}
@@ -46,7 +45,7 @@ def check_output(path: Path, kind: str) -> None:
     a folder, or in the place of a file of a dataset, a run or an evaluation. A device may have any name."""
     if path.is_dir():
         raise InputError(f"{path}: expected a file to write, found a folder")
-    if path.exists() and not path.is_file():
+    if path.parent == Path("/dev") or (path.exists() and not path.is_file()):
         return
     suffixes = SUFFIXES[kind]
     if path.suffix.lower() not in suffixes:
@@ -71,13 +70,14 @@ def _owner(folder: Path, name: str, kind: str) -> str:
 
 
 def _is_of_dataset(folder: Path, name: str) -> bool:
-    """Whether SHA256SUMS names a file; of a dataset without it, transforms.json, also without a suffix."""
+    """Whether SHA256SUMS names a file; of a dataset without it, transforms.json, paths also without a suffix."""
     with suppress(InputError):  # of another program, or damaged, which `verify` reports
         if listed := read_manifest(folder):
             return name in (*listed, DIGESTS)
     with suppress(InputError):
-        named = {str(PurePosixPath(text)) for text in _texts(read_json(folder / "transforms.json", MAX_LIST_BYTES))}
-        return name == "transforms.json" or bool(named & {name, str(PurePosixPath(name).with_suffix(""))})
+        texts = list(_texts(read_json(folder / "transforms.json", MAX_LIST_BYTES)))
+        stems = {str(PurePosixPath(text)) for text in texts if "/" in text}
+        return name in ("transforms.json", *texts) or bool(stems & {name, str(PurePosixPath(name).with_suffix(""))})
     return False
 
 
@@ -91,9 +91,10 @@ def _texts(value: object) -> Iterator[str]:
 
 
 def check_evaluation_folder(out: Path) -> None:
-    """Raise InputError where a folder holds files and no evaluation, finished or interrupted, has written them."""
-    if not _is_evaluation(out):
-        _check_files(out, _UNFINISHED, "evaluation")
+    """Raise InputError where a folder has a report or numbers that no evaluation has written. Other files stay."""
+    mine = next((name for name in ("metrics.json", "report.html") if (out / name).exists()), None)
+    if mine and not _is_evaluation(out):
+        raise InputError(f"{out}: expected a new folder, or one of an earlier evaluation, found another {mine} in it")
 
 
 def _is_evaluation(folder: Path) -> bool:
@@ -111,21 +112,21 @@ def clear_evaluation(out: Path) -> None:
 
 
 def check_sweep_folder(out: Path) -> None:
-    """Raise InputError where a folder holds files and no sweep has written them."""
-    if not (out / "sweep.png").is_file():
-        _check_files(out, None, "sweep")
+    """Raise InputError where a folder holds files that no sweep, finished or interrupted, has written: its frames are
+    numbered from 0 on, those of others hardly ever."""
+    names = sorted(_files(out))
+    foreign = [name for name in names if not _SWEEP.fullmatch(name)]
+    frames = [name for name in names if name.startswith("frames/")]
+    if not foreign and [Path(name).stem for name in frames] != [f"{i:04d}" for i in range(len(frames))]:
+        foreign = frames
+    if foreign:
+        expected = "expected an empty or new folder, or one of an earlier sweep"
+        raise InputError(f"{out}: {expected}, found other files in it ({foreign[0]})")
 
 
 def clear_sweep(out: Path) -> None:
     """Take away all that a sweep has written into a folder. Raises OSError where that fails."""
     _remove(out, _SWEEP)
-
-
-def _check_files(out: Path, own: re.Pattern[str] | None, what: str) -> None:
-    """own: files that may be there"""
-    if any(own is None or not own.fullmatch(name) for name in _files(out)):
-        expected = f"an empty or new folder, or one of an earlier {what}"
-        raise InputError(f"{out}: expected {expected}, found other files in it")
 
 
 def _files(folder: Path) -> Iterator[str]:

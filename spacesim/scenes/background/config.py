@@ -34,6 +34,6 @@ class BackgroundConfig:
 
     def showing(self, words: str) -> "BackgroundConfig":
         """The same with what `words` name, "earth", "stars" or "earth,stars", in place of what it draws."""
-        named = words.split(",")
+        named = [word.strip() for word in words.split(",")]
         expect(set(named) <= set(WORDS), "background", f"one or more of {', '.join(WORDS)}", words)
         return replace(self, earth="earth" in named, stars="stars" in named)

@@ -50,6 +50,7 @@ from spacesim.splat.train.warm_start import Attraction, WarmStart
 log = logging.getLogger(__name__)
 
 BACKGROUNDS = 1024  #: colours that are drawn at once
+MAX_GAUSSIANS = 10**8  #: training so many takes some 150 GB; an array of 42 numbers of each has no more than 2^32
 
 
 class Trainer(TrainingLoop):
@@ -388,7 +389,11 @@ def _backgrounds(seed: int, block: int) -> np.ndarray:
 
 
 def _check_sizes(dataset: Dataset, config: TrainConfig) -> None:
-    """Raises InputError for pictures that cannot be made as small as training begins with."""
+    """Raises InputError for pictures that cannot be made as small as training begins with, and for more Gaussians than
+    can be."""
+    if config.refinement.max_gaussians > MAX_GAUSSIANS:
+        expected = f"refinement.max_gaussians: expected at most {MAX_GAUSSIANS}"
+        raise InputError(f"{expected}, found {config.refinement.max_gaussians}")
     least = config.downscale(0)
     for frame in dataset.train:
         if min(frame.camera.width, frame.camera.height) < least:
@@ -402,7 +407,7 @@ def _views(dataset: Dataset, config: TrainConfig) -> TrainingViews:
     truth += ("radiance",) if config.light and config.light.radiance else ()
     prior = MeshPrior.of(dataset) if config.shape_terms and config.prior == "mesh" else None
     suns = config.light is not None and config.light.field.knows_sun and config.sun == "given"
-    return TrainingViews(dataset, config.seed, suns, truth, prior)
+    return TrainingViews(dataset, config.seed, suns, truth, prior, config.views_per_step)
 
 
 def _learned(light: LightModel | None) -> list[Float]:

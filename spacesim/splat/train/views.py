@@ -56,6 +56,7 @@ class TrainingViews:
     suns: every frame must name its Sun; see `sunlit_frames`
     truth: path-traced planes that it must have, by name
     surface: gives depth and normals of a camera, in place of the path-traced ones; see `prior.MeshPrior`
+    at_once: how many views in a row are kept at least
     Raises InputError where a frame has not what it must have, or its truth is not whole, and where `sunlit_frames`
     does.
     """
@@ -67,6 +68,7 @@ class TrainingViews:
         suns: bool = False,
         truth: Sequence[str] = (),
         surface: Callable[[Camera], tuple[np.ndarray, np.ndarray]] | None = None,
+        at_once: int = 1,
     ) -> None:
         if not dataset.train:
             raise InputError(f"{dataset.root}: expected at least one training image, found none")
@@ -81,7 +83,7 @@ class TrainingViews:
         self._empty: set[int] = set()  # views that have been reported to show nothing
         self._order = lru_cache(maxsize=2)(self._shuffle)
         in_memory, on_device = kept_bytes()
-        kept = max(1, in_memory // largest)
+        kept = max(at_once, in_memory // largest)
         self._cached = lru_cache(maxsize=kept)(self._take)
         self._ahead: dict[int, Future[TrainingView]] = {}  # views that are being decoded
         self._decoded: set[int] = set()

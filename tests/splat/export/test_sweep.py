@@ -178,10 +178,23 @@ def test_an_earlier_sweep_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "encoder", lambda: None)
     sweep(Lit(), CAMERA, suns_around(3), tmp_path, keep_frames=True)
     (tmp_path / "sweep.mp4").touch()
-    (tmp_path / "frames" / "mine.txt").touch()
     sweep(Lit(), CAMERA, suns_around(2), tmp_path, keep_frames=True)
     left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.*")}
-    assert left == {"sweep.png", "frames/0000.png", "frames/0001.png", "frames/mine.txt"}
+    assert left == {"sweep.png", "frames/0000.png", "frames/0001.png"}
+    (tmp_path / "sweep.png").unlink()  # as where a sweep was interrupted
+    sweep(Lit(), CAMERA, suns_around(2), tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == ["sweep.png"]
+
+
+@pytest.mark.parametrize("name", ["frames/0001.png", "transforms.json", "frames/mine.txt"])
+def test_a_folder_with_frames_of_others_is_refused_and_left_alone(name, tmp_path):
+    """Also beside an earlier sweep's sheet."""
+    for file in ("sweep.png", name):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    with pytest.raises(InputError, match=rf"found other files in it \({name}\)"):
+        sweep(Lit(), CAMERA, suns_around(2), tmp_path)
+    assert (tmp_path / name).exists()
 
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (90, 0), (200, 45), (0, 90), (300, -30)])

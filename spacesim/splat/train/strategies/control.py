@@ -22,7 +22,6 @@ from spacesim.splat.train.strategies.densify import DensificationCounts, append_
 from spacesim.splat.train.strategies.strategy import MAX_STEPS, MAX_THRESHOLD, OnScreen, Strategy
 
 WINDOW = ("gradient", "seen", "radius")  #: statistics since the last densification step
-MAX_GAUSSIANS = 10**8  #: training so many takes some 150 GB; an array of 42 numbers of each has no more than 2^32
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,8 @@ class DensificationConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check_ranges(self, max_gaussians=(1, MAX_GAUSSIANS))
+        if self.max_gaussians < 1:
+            raise InputError(f"max_gaussians: expected at least 1, found {self.max_gaussians}")
         if not 0 < self.prune_opacity < 0.5:  # a reset lowers to twice as much
             raise InputError(f"prune_opacity: expected above 0 and below 0.5, found {self.prune_opacity}")
         if not 0 < self.split_screen_size < float("inf"):
