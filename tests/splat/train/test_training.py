@@ -620,3 +620,13 @@ def test_a_checkpoint_with_another_header_is_refused(small_dataset, tmp_path, he
     )
     with pytest.raises(InputError, match=r"c\.safetensors: (header: )?[a-z\[\]0-9_.: ]*expected"):
         Trainer(small_dataset, CONFIG).restore(tmp_path / "c.safetensors")
+
+
+def test_a_step_of_several_views_reads_each_once(small_dataset, monkeypatch):
+    """However few are kept."""
+    read, load = [], views.load_image
+    monkeypatch.setattr(views, "kept_bytes", lambda: (0, 0))
+    monkeypatch.setattr(views, "load_image", lambda data, frame: read.append(frame.file_path) or load(data, frame))
+    trainer = Trainer(small_dataset, replace(CONFIG, views_per_step=3))
+    trainer.step()
+    assert len(read) == len(set(read)) == 3
