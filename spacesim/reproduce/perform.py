@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,8 +110,8 @@ def _perform(root: Path, size: Size, work: Experiment, reporting: Reporting) -> 
             evaluated(scene, pair, folder / part, replace(measures, geometry=None), title, reporting)
         elif part == "one-sun":
             other = read_dataset(data_folder(root, part))
-            draw = partial(_draw_depth, run, other, folder / part, size.fully_lit_deg)
-            evaluated(run, other, folder / part, measures, title, reporting, draw)
+            _draw_depth(run, other, folder / part, size.fully_lit_deg)
+            evaluated(run, other, folder / part, measures, title, reporting)
         elif part == "frames":
             with reporting(title, "scenes") as tell:
                 write_json(folder / _last_file(part), time_frames(run, dataset, tell))
@@ -132,21 +131,14 @@ def trained(folder: Path, dataset: Dataset, config: methods.Config, name: str, r
 
 
 def evaluated(
-    run: "Predictor",
-    dataset: Dataset,
-    folder: Path,
-    measures: EvaluateConfig,
-    name: str,
-    reporting: Reporting,
-    draw: Callable[[], None] = lambda: None,
+    run: "Predictor", dataset: Dataset, folder: Path, measures: EvaluateConfig, name: str, reporting: Reporting
 ) -> JsonDict:
-    """What metrics.json of an evaluation holds, which its report ends. draw: adds files before that"""
+    """What metrics.json of an evaluation and its report hold."""
     if (folder / "report.html").exists():
         known: JsonDict = read_json(folder / "metrics.json")
         return known
     with reporting(f"evaluate {name}", "frames") as report:
         metrics = evaluate(run, dataset, folder, measures, report)
-    draw()
     write_report([folder], folder / "report.html")
     return metrics
 

@@ -5,7 +5,7 @@ and L. Ohlsson, "Conservative rasterization", GPU Gems 2, 2005).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, reduce
 
 import drjit as dr
@@ -18,6 +18,7 @@ from spacesim.backend.upload import upload
 from spacesim.data.images import undistort_points
 from spacesim.data.records import Camera
 from spacesim.scenes.cameras.kernel_camera import RADIUS, KernelCamera, Units, record_on_cuda
+from spacesim.scenes.lights.emitters import kernel_input
 from spacesim.scenes.scene import Scene
 
 TILE = 4  #: pixels of a side
@@ -32,22 +33,20 @@ FARTHEST = 1e5  #: pixels from the picture: edges of triangles with corners beyo
 
 @dataclass(frozen=True)
 class Tiles:
-    """Of a picture without distortion: where the scene may be seen."""
+    """Of a picture without distortion, so many times as wide about its centre: where the scene may be seen."""
 
     marks: Bool  #: [ceil(H / TILE) ceil(W / TILE) + 1], row by row; at the end: all over
-    width: int  #: pixels
-    height: int  #: pixels
-    focal: list[Float]  #: fx and fy, pixels
-    centre: list[Float]  #: cx and cy, pixels
+    wider: Float  #: times
 
-    def may_show(self, x: Float, y: Float) -> Bool:
-        """Whether the scene may be seen in directions (x, y, 1). Outside the picture it may be anywhere."""
+    def may_show(self, view: KernelCamera, x: Float, y: Float) -> Bool:
+        """Whether the scene may be seen in directions (x, y, 1) of `view`. Outside the picture it may be anywhere."""
         mi = backend.mitsuba()
-        column, row = (at * focal + centre for at, focal, centre in zip((x, y), self.focal, self.centre, strict=True))
-        is_inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
-        tile = mi.UInt32(row) // TILE * _across(self) + mi.UInt32(column) // TILE
+        axes = zip((x, y), _focal(view, self.wider), view.centre, strict=True)
+        column, row = (at * focal + centre for at, focal, centre in axes)
+        is_inside = (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+        tile = mi.UInt32(row) // TILE * _across(view) + mi.UInt32(column) // TILE
         marked = dr.gather(mi.Bool, self.marks, tile, is_inside)
-        return marked | ~is_inside | dr.gather(mi.Bool, self.marks, mi.UInt32(_count(self)))
+        return marked | ~is_inside | dr.gather(mi.Bool, self.marks, mi.UInt32(_count(view)))
 
 
 class Coverage:
@@ -55,18 +54,20 @@ class Coverage:
 
     def __init__(self, scene: Scene, units: Units, distortion: Sequence[float]) -> None:
         corners = units.points(np.asarray(scene.mesh.triangles).reshape(-1, 3)).reshape(-1, 9)
-        self._corners, self._units = [upload(column) for column in corners.T], units
+        self._corners = [upload(column) for column in corners.T]
         self._distortion = tuple(distortion) if any(distortion) else ()
         self._mark = record_on_cuda(_mark_tiles)
 
-    def tiles(self, camera: Camera) -> Tiles:
-        """Of what `camera` sees through the lens, as a picture without distortion shows that."""
-        if self._distortion:
-            wider = _widening(camera.width, camera.height, camera.fx, camera.fy, self._distortion)
-            camera = replace(camera, fx=camera.fx / wider, fy=camera.fy / wider)
-        view = KernelCamera.of(camera, self._units)
-        marks = self._mark(view, self._corners)
-        return Tiles(marks, view.width, view.height, view.focal, view.centre)
+    def tiles(self, camera: Camera, view: KernelCamera) -> Tiles:
+        """Of what `camera` sees through the lens. view: the same camera"""
+        lens = camera.width, camera.height, camera.fx, camera.fy, self._distortion
+        wider = kernel_input(_widening(*lens) if self._distortion else 1.0)
+        return Tiles(self._mark(view, wider, self._corners), wider)
+
+
+def _focal(view: KernelCamera, wider: Float) -> list[Float]:
+    """Of a picture so many times as wide."""
+    return [focal / wider for focal in view.focal]
 
 
 @lru_cache(maxsize=64)
@@ -81,25 +82,26 @@ def _widening(width: int, height: int, fx: float, fy: float, distortion: tuple[f
     return float(min(np.max(times[np.isfinite(times)], initial=1.0) * SPARE, WIDEST))
 
 
-def _across(view: KernelCamera | Tiles) -> int:
+def _across(view: KernelCamera) -> int:
     return -(-view.width // TILE)
 
 
-def _down(view: KernelCamera | Tiles) -> int:
+def _down(view: KernelCamera) -> int:
     return -(-view.height // TILE)
 
 
-def _count(view: KernelCamera | Tiles) -> int:
+def _count(view: KernelCamera) -> int:
     return _across(view) * _down(view)
 
 
-def _mark_tiles(view: KernelCamera, corners: Sequence[Float]) -> Bool:
-    """The tiles that triangles reach. corners: x, y and z of each triangle's three, in Mitsuba's coordinates, [F]."""
+def _mark_tiles(view: KernelCamera, wider: Float, corners: Sequence[Float]) -> Bool:
+    """The tiles that triangles reach, see `Tiles`. corners: x, y and z of each triangle's three, in Mitsuba's
+    coordinates, [F]."""
     mi = backend.mitsuba()
-    tiles = dr.zeros(mi.Bool, _count(view) + 1)
+    tiles, focals = dr.zeros(mi.Bool, _count(view) + 1), _focal(view, wider)
     sides, depths = _in_camera(view, [mi.Vector3f(corners[k : k + 3]) for k in (0, 3, 6)])
     seen = _largest(depths) > -SLACK
-    for side, focal, centre, size in zip(sides, view.focal, view.centre, (view.width, view.height), strict=True):
+    for side, focal, centre, size in zip(sides, focals, view.centre, (view.width, view.height), strict=True):
         before = [at + (centre + MARGIN) / focal * z for at, z in zip(side, depths, strict=True)]
         after = [at - (size + MARGIN - centre) / focal * z for at, z in zip(side, depths, strict=True)]
         seen &= (_largest(before) > -SLACK) & (_smallest(after) < SLACK)
@@ -111,7 +113,7 @@ def _mark_tiles(view: KernelCamera, corners: Sequence[Float]) -> Bool:
     scales = [1 / dr.maximum(depth, CLOSE) for depth in depths]
     x, y = (
         [at * scale * focal + centre for at, scale in zip(side, scales, strict=True)]
-        for side, focal, centre in zip(sides, view.focal, view.centre, strict=True)
+        for side, focal, centre in zip(sides, focals, view.centre, strict=True)
     )
     is_far = ~(_largest([dr.abs(value) for value in (*x, *y)]) < FARTHEST)
     left, width = _tile_range(x, _across(view))

@@ -128,7 +128,7 @@ class Renderer:
     ) -> tuple[list[AsyncArray], list[AsyncArray] | None]:
         """Sums of all passes (under the Sun, by the Earth's light, None without)."""
         view = KernelCamera.of(camera, self._loaded.units)
-        tiles, earthlit = self._coverage.tiles(camera), self._loaded.earthlit
+        tiles, earthlit = self._coverage.tiles(camera, view), self._loaded.earthlit
         sunlight = self._launch_passes(self._loaded.sunlit, view, tiles, seed, spp)
         return sunlight, self._launch_passes(earthlit, view, tiles, (*seed, _EARTH), spp) if earthlit else None
 
@@ -199,7 +199,7 @@ def _trace_paths(
     offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
     x, y = view.directions(pixel, offset, distortion)
     ray, _ = view.rays_to(x, y)
-    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=tiles.may_show(x, y))
+    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=tiles.may_show(view, x, y))
     channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
     dr.eval(channels)
     *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)

@@ -37,7 +37,7 @@ def hits_and_coverage(
     offset = mi.Point2f(mi.Float(sample % ACROSS), mi.Float(sample // ACROSS)) / (ACROSS - 1)
     x, y = view.directions(pixel, offset, distortion)
     hit = loaded.ray_test(view.rays_to(x, y)[0]).numpy()
-    covered = Coverage(scene, units, distortion).tiles(camera).may_show(x, y).numpy()
+    covered = Coverage(scene, units, distortion).tiles(camera, view).may_show(view, x, y).numpy()
     assert not (hit & ~covered).any()
     shape = camera.height, camera.width, ACROSS**2
     return hit.reshape(shape).any(axis=2), covered.reshape(shape).all(axis=2)
@@ -143,9 +143,11 @@ def test_pictures_are_those_of_all_pixels_to_the_bit(scene, lens, monkeypatch):
     close = [replace(spec.camera, fx=6 * spec.camera.fx, fy=6 * spec.camera.fy) for spec in plan.specs]
     cameras = [*(spec.camera for spec in plan.specs), *([] if lens else distant), *close]
     some = [plan.renderer.render(camera, Sun.from_angles(30, 20), (0, 1)) for camera in cameras]
-    shares = [float(plan.renderer._coverage.tiles(camera).marks.numpy().mean()) for camera in cameras]
+    views = [KernelCamera.of(camera, plan.renderer._loaded.units) for camera in cameras]
+    tiles = [plan.renderer._coverage.tiles(camera, view) for camera, view in zip(cameras, views, strict=True)]
+    shares = [float(some_tiles.marks.numpy().mean()) for some_tiles in tiles]
     assert 0 < min(shares) < (0.7 if lens else 0.1)
-    monkeypatch.setattr(Tiles, "may_show", lambda _tiles, _x, _y: backend.mitsuba().Bool(True))
+    monkeypatch.setattr(Tiles, "may_show", lambda _tiles, _view, _x, _y: backend.mitsuba().Bool(True))
     for camera, truth_of_some in zip(cameras, some, strict=True):
         whole = plan.renderer.render(camera, Sun.from_angles(30, 20), (0, 1))
         for name in ("radiance", "alpha", "radiance_earth"):
