@@ -128,11 +128,12 @@ def add_peer_kernels(result: dict[str, Any], peers: Mapping[str, Any]) -> None:
     inputs = common.sphere_arrays(result["gaussians"]), common.camera_from(DIRECTION, result["pixels"])
     ours = Pipeline(*inputs)
     for name, peer in peers.items():
-        theirs, works = result["peers"][name], stages_of(peer.Frame(*inputs))
+        frame = peer.Frame(*inputs)
+        theirs, works = result["peers"][name], stages_of(frame)
         theirs["kernels"] = {stage: device_milliseconds(work) for stage, work in works.items()}
         theirs["our kernels"] = {stage: device_milliseconds(getattr(ours, stage)) for stage in works}
         theirs["ratios"] = ratios(result, theirs)
-        theirs["apart"] = apart(ours.picture(), peer.Frame(*inputs).whole().cpu().numpy())
+        theirs["apart"] = apart(np.moveaxis(ours.frame().image("color"), -1, 0), frame.whole().cpu().numpy())
 
 
 def apart(ours: np.ndarray, theirs: np.ndarray) -> float:

@@ -277,7 +277,7 @@ def _processors() -> tuple[float, float]:
     return sum(ticks), ticks[-1]
 
 
-_BEFORE = os.getloadavg()[0], _processors()  # a benchmark
+_BEFORE = os.getloadavg()[0], _processors()  # the benchmark begins: load, and what `_processors` says
 
 
 def machine() -> dict[str, str]:

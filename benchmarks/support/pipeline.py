@@ -10,6 +10,7 @@ from spacesim.data.records import Camera
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import bin_splats
+from spacesim.splat.raster.output import RenderOutput
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
 from spacesim.splat.train.loss.photometric import photometric_loss
@@ -68,15 +69,11 @@ class Pipeline:
         gradients = ViewGradients(self.camera, self.grad_splats.splats, {"color": self.grad_splats.features})
         self._update(self.gaussians, self.optimizer, DEGREE, [gradients], self.factors, {})
 
-    def frame(self) -> None:
+    def frame(self) -> RenderOutput:
         """Parameters to picture, as a user asks for it: colour and alpha, without gradients."""
         output = render(self.gaussians, self.camera, outputs=("color",))
         dr.eval(output.color, output.alpha)
-
-    def picture(self) -> np.ndarray:
-        """[3, H, W] of `frame`, over black."""
-        width, height = self.size
-        return np.array(render(self.gaussians, self.camera, outputs=("color",)).color).reshape(3, height, width)
+        return output
 
     @property
     def blended_pairs(self) -> int:

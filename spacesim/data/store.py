@@ -28,7 +28,7 @@ from spacesim.data.files import (
     write_bytes,
     write_json,
 )
-from spacesim.data.images import Undistortion, check_size_of, exr_bytes, load_image, png_bytes, read_exr, read_png
+from spacesim.data.images import Undistortion, exr_bytes, load_image, png_bytes, read_exr, read_png, read_sized
 from spacesim.data.integrity.manifest import check_manifest, digest_of, read_manifest, write_manifest
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import read_points, write_points
@@ -116,7 +116,7 @@ def load_depth(dataset: Dataset, frame: Frame) -> np.ndarray:
     if frame.depth_file_path is None:
         raise InputError(f"{dataset.root}: expected depth of {frame.file_path}, found no depth_file_path")
     path = dataset.root / frame.depth_file_path
-    steps = _read_label(path, frame.camera)
+    steps = read_sized(path, frame.camera)
     if steps.ndim != 2:
         raise InputError(f"{path}: expected depth in one channel, found {steps.shape[2]}")
     return (steps * dataset.depth_unit).astype(np.float32)
@@ -381,17 +381,11 @@ def find_unreadable_files(path: Path) -> list[str]:
             check(load_truth, dataset, frame)
         for key in ("shadow_path", "silhouette_path", "id_path", "depth_file_path"):
             if getattr(frame, key) is not None:
-                check(_read_label, dataset.root / getattr(frame, key), frame.camera)
+                check(read_sized, dataset.root / getattr(frame, key), frame.camera)
     for ply in (dataset.ply_file_path, dataset.mesh_path):
         if ply is not None:
             check(read_points, dataset.root / ply)
     return problems
-
-
-def _read_label(path: Path, camera: Camera) -> np.ndarray:
-    pixels = read_png(path)
-    check_size_of(path, (pixels.shape[1], pixels.shape[0]), camera)
-    return pixels
 
 
 def _describe_frames(

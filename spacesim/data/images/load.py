@@ -19,7 +19,7 @@ def load_image(dataset: Dataset, frame: Frame) -> Image:
     where a file is missing, broken or of another size than the camera.
     """
     check_frame(dataset, frame)
-    pixels = _read_sized(dataset.root / frame.file_path, frame.camera)
+    pixels = read_sized(dataset.root / frame.file_path, frame.camera)
     values = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
     alpha = np.ones(values.shape[:2], np.float32)
     if values.shape[2] == 4:
@@ -57,7 +57,8 @@ def _without_ignored(rgb: np.ndarray, alpha: np.ndarray, valid: np.ndarray) -> t
     return np.where(valid[..., None], rgb, np.float32(0)), np.where(valid, alpha, np.float32(1))
 
 
-def _read_sized(path: Path, camera: Camera) -> np.ndarray:
+def read_sized(path: Path, camera: Camera) -> np.ndarray:
+    """`read_png` of a picture as large as the camera's. Raises InputError for another size."""
     pixels = read_png(path)
     check_size_of(path, (pixels.shape[1], pixels.shape[0]), camera)
     return pixels
@@ -72,5 +73,5 @@ def check_size_of(path: Path, size: tuple[int, int], camera: Camera) -> None:
 
 def read_labels(path: Path, camera: Camera) -> np.ndarray:
     """[H, W] of a mask or silhouette, its brightest channel. Raises InputError for another size than the camera's."""
-    pixels = _read_sized(path, camera)
+    pixels = read_sized(path, camera)
     return pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=-1)

@@ -140,7 +140,7 @@ def _files(folder: Path) -> Iterator[str]:
 def _remove(folder: Path, own: re.Pattern[str], first: Sequence[str] = ()) -> None:
     """Take away the files that are its `own`, `first` ones before others, and folders that are empty then."""
     names = [name for name in _files(folder) if own.fullmatch(name)]
-    for name in sorted(names, key=lambda name: (name not in first, *(name != one for one in first))):
+    for name in (*first, *names):
         (folder / name).unlink(missing_ok=True)
     within = {place for name in names for place in PurePosixPath(name).parents if place.parts}
     for place in sorted(within, key=lambda place: -len(place.parts)):
