@@ -8,6 +8,7 @@ costs a twentieth of what the adjoint gains; on a CPU it costs more than that (d
 
 from collections.abc import Callable
 from functools import reduce
+from operator import and_
 from typing import cast
 
 import drjit as dr
@@ -35,6 +36,8 @@ from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lis
 
 BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
+NOTHING = -1e30  #: logarithm of the opacity of what does not show
+SIGN = 2**31  #: bit of a number that says that it is negative
 CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
 
 Finish = Callable[[Float, list[Float]], list[Float]]
@@ -131,7 +134,7 @@ def _walk(
     shape, turn, thread = lists.shape, TURN[select()], walks.thread
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
-        return (k < end) & (reduce(dr.maximum, transmittance) > 0)
+        return (k < end) & (reduce(and_, map(_bits, transmittance)) < SIGN)
 
     def blend(
         k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]
@@ -140,20 +143,20 @@ def _walk(
             snapshots.keep(k, transmittance, sums)
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
-            listed = k + u < end if u else ad.Bool(True)
-            record = records.load(lists, k + u, listed)
+            record = records.load(lists, dr.minimum(k + u, end - 1) if u else k)
+            if u:
+                record[5] = dr.select(k + u < end, record[5], NOTHING)
             powers = exponents(record, thread.x, thread.y, shape)
             for p in range(shape.pixels):
-                alpha = dr.minimum(exp2(powers[p]), ALPHA_MAX)
-                reached = listed & (powers[p] >= POWER_MIN) & (transmittance[p] > 0)
-                weight = alpha * transmittance[p]
-                behind = transmittance[p] - weight
-                blends = reached & ((behind > TRANSMITTANCE_MIN) | ~walks.finishes[p])
+                shows = powers[p] >= POWER_MIN
+                weight = dr.minimum(exp2(powers[p]), ALPHA_MAX) * transmittance[p]
+                behind = transmittance[p] - weight  # negative where the pixel is finished: it blends nothing more
+                blends = shows & ((behind > TRANSMITTANCE_MIN) | ~walks.finishes[p])
                 weight = dr.select(blends, weight, 0)
                 for c, value in enumerate(sums[p]):
                     sums[p][c] = dr.fma(weight, record[6 + c], value)
-                left = dr.select(blends, behind, -transmittance[p])  # finished: negative from then on
-                transmittance[p] = dr.select(reached, left, transmittance[p])
+                finished: Float = dr.select(shows, _negative(transmittance[p]), transmittance[p])
+                transmittance[p] = dr.select(blends, behind, finished)
                 last[p] = dr.select(blends, k + (u + 1), last[p])
         return k + turn, end, transmittance, sums, last
 
@@ -161,6 +164,16 @@ def _walk(
     if lists.capacity > 0:
         state = dr.while_loop(state, alive, blend, mode="symbolic", label="blend")
     return state[2:]
+
+
+def _bits(value: Float) -> UInt32:
+    """Of a number, as they are."""
+    return cast(UInt32, dr.reinterpret_array(ad.UInt32, value))
+
+
+def _negative(value: Float) -> Float:
+    """-|x|."""
+    return cast(Float, dr.reinterpret_array(ad.Float, _bits(value) | SIGN))
 
 
 def _of_pixels(values: list[NumberT], lists: TileLists, walks: Walks, otherwise: int, cut: bool) -> NumberT:
