@@ -20,6 +20,7 @@ from spacesim.learning.networks.network import (
     round_up_rows,
     row_of,
 )
+from spacesim.learning.networks.packets import activated, masked
 
 
 def first_layer_part(shape: MlpShape, weights: list[Float], items: TensorXf, inputs: int) -> PartialLayer:
@@ -56,8 +57,8 @@ def forward(
             return warps.outputs_of_few(matrix, bias, tape[-1]), MlpTape(tape, input_layer)
         else:
             value = product(ad.TensorXf(matrix, (rows, columns)), tape[-1])
-        if by_warps and not is_last:
-            tape.append(warps.activated(value, bias))
+        if first_layer is None and not is_last:
+            tape.append(activated(value, bias))
             continue
         value += ad.TensorXf(bias, (rows, 1))
         if first_layer and i == 0:
@@ -99,7 +100,7 @@ def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:
         matrix = way.input_matrix() if i == 0 else ad.TensorXf(way.weights[1 + 2 * i], shape.sizes[i])
         gradient = product(matrix, gradient, At=True)
         if i > 0:
-            gradient = dr.select(values[i] > 0, gradient, 0)
+            gradient = masked(gradient, values[i])
     return _totals(way, parts[::-1]), gradient
 
 

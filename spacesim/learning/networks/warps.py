@@ -6,36 +6,13 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array4f, Bool, Float, TensorXf, UInt32
 from spacesim.learning.networks.joined import Joined, is_within
 from spacesim.learning.networks.network import MlpShape, WayBack, product
+from spacesim.learning.networks.packets import Packets
 
 WARP = 32  #: threads that sum up together
-COLUMNS = 4 * WARP  #: of a matrix that they sum up, of which there are a multiple
+FOUR = 4  #: columns that a thread reads at once
+COLUMNS = FOUR * WARP  #: of a matrix that they sum up, of which there are a multiple
 GROUPS = 8  #: of matrices that are summed up at the same time
 FEW = 4  #: rows of a matrix at which products by tiles are slow
-
-
-class Fours:
-    """The numbers of B matrices [C, m] by fours along their columns, a thread each."""
-
-    def __init__(self, matrices: int, rows: int, m: int) -> None:
-        self.shape, self._fours = (matrices, rows, m), m // 4
-        self._entry = dr.arange(ad.UInt32, matrices * rows * self._fours)
-        self.matrix, self.within = self._entry // (rows * self._fours), self._entry % self._fours
-        self.row = self._entry // self._fours % rows
-
-    def load(self, values: TensorXf) -> Array4f:
-        """Of a TensorXf [B, C, m]."""
-        return dr.gather(ad.Array4f, values.array, self._entry)
-
-    def load_row(self, values: TensorXf, row: int) -> Array4f:
-        """What stands above or below in a row of a TensorXf [B, any, m]."""
-        return dr.gather(ad.Array4f, values.array, (self.matrix * values.shape[1] + row) * self._fours + self.within)
-
-    def store(self, values: Array4f) -> TensorXf:
-        """TensorXf [B, C, m]."""
-        matrices, rows, m = self.shape
-        numbers = dr.empty(ad.Float, matrices * rows * m)
-        dr.scatter(numbers, values, self._entry, mode=dr.ReduceMode.NoConflicts)
-        return ad.TensorXf(numbers, self.shape)
 
 
 class WarpSums:
@@ -51,7 +28,7 @@ class WarpSums:
         self._taken += rows
         return self._taken - rows
 
-    def add(self, values: Array4f, at: Fours, row: UInt32, active: Bool | bool = True) -> None:
+    def add(self, values: Array4f, at: Packets, row: UInt32, active: Bool | bool = True) -> None:
         """What stands `at` to a row of its matrix."""
         warp = (at.matrix * self.rows + row) * self._warps_a_row + at.within // WARP
         four = (values[0] + values[1]) + (values[2] + values[3])
@@ -63,7 +40,7 @@ class WarpSums:
 
     def of_rows(self, values: TensorXf) -> int:
         """The first of the rows that are those of an evaluated TensorXf [B, C, m]."""
-        at, first = Fours(*values.shape), self.take(values.shape[1])
+        at, first = Packets(values.shape, FOUR), self.take(values.shape[1])
         self.add(at.load(values), at, first + at.row)
         return first
 
@@ -80,12 +57,6 @@ Part = Float | int
 def is_few(rows: int) -> bool:
     """Whether so many outputs are computed without products by tiles."""
     return rows <= FEW
-
-
-def activated(values: TensorXf, bias: Float) -> TensorXf:
-    """ReLU of a TensorXf [B, C, m] and a bias [C]."""
-    at = Fours(*values.shape)
-    return at.store(dr.maximum(at.load(values) + dr.gather(ad.Float, bias, at.row), 0))
 
 
 def outputs_of_few(matrix: Float, bias: Float, items: TensorXf) -> list[Float]:
@@ -125,7 +96,7 @@ def backward(way: WayBack, sums: WarpSums) -> tuple[list[Part], TensorXf]:
     by_bias: int | None = None
     for i in reversed(range(1, shape.layers)):
         rows, columns = shape.sizes[i]
-        at, weights = Fours(*values[i].shape), way.weights[1 + 2 * i]
+        at, weights = Packets(values[i].shape, FOUR), way.weights[1 + 2 * i]
         if is_few(rows):
             few, first = [at.load_row(gradient, row) for row in range(rows)], sums.take(rows * columns)
             before = ad.Array4f(0)
