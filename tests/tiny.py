@@ -12,6 +12,8 @@ from spacesim.cli import main
 
 GENERATE = ("--views", "6", "--test-views", "2", "--resolution", "40", "--spp", "4")
 TRAIN = ("--preset", "demo", "--iterations", "50", "--set", "init_count=300")
+#: settings: shadows are refined by a network, which `demo` has for shadow splatting alone
+REFINED = {"light.shadow.refine": {"width": 32, "sun": {"kind": "harmonics", "degree": 0}, "positions": "world"}}
 TRAIN_FIELD = ("--preset", "demo", "--iterations", "60", "--set=rays=512", "--set=samples=12", "--set=chunk=2048")
 SPARING = f"""import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})

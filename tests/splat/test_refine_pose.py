@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from tiny import REFINED
 
 from spacesim import RefinedPose, refine_pose
 from spacesim.data.errors import InputError
@@ -43,7 +44,7 @@ def lit_run(known_gaussians) -> Run:
     """In the light of networks that nobody has trained, with a bounce; mirrors at random would show a new colour from
     each side."""
     many = {"light.field.features": 16, "light.bounce": 64, "light.gloss": False}  # so that colours differ
-    config, rng = with_settings(preset("demo", "shadow-map"), many).light, np.random.default_rng(3)
+    config, rng = with_settings(preset("demo", "shadow-map"), REFINED | many).light, np.random.default_rng(3)
     dark = {**known_gaussians, "sh": np.zeros((60, 0, 3)), "features": 2 * rng.normal(size=(60, config.features))}
     return run_of(Gaussians.from_numpy(dark), LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 3.0, 0.8), 0))
 

@@ -253,7 +253,7 @@ def preset(name: str, method: str = "vanilla", strategy: str = "default") -> Tra
     values = merged(values, sections["strategies"].get(strategy, {}))
     strategy_settings = {"kind": strategy, **values.get("strategy", {})}
     values |= {"preset": name, "method": method, "strategy": strategy_settings}
-    return _read(Document(str(ASSETS / f"{name}.toml"), values, {}), Rules())
+    return _read(Document(str(ASSETS / f"{name}.toml"), values, {}), Rules(none="none"))
 
 
 def warm_start(name: str) -> WarmStartConfig:

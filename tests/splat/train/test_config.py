@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tiny import REFINED
 
 import spacesim as ss
 from spacesim.data.errors import InputError
@@ -30,7 +31,7 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "893534424ed1ba25",
+    "demo": "e8c5830f504fafc1",
     "fast": "d7135c64e2dbdabd",
     "fine": "ce3084ef52447354",
     "thesis": "d211ef461c15871c",
@@ -58,6 +59,8 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
         settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03
+    if (config.preset, config.method) == ("demo", "shadow-map"):
+        settings |= REFINED
     if config.method == "shadow-splat":  # of these the one of `fine`
         settings |= {"refinement.split_screen": "all", "refinement.split_screen_size": 0.015}
         settings |= {"light.shadow.bias": 5.0, "light.shadow.size": 1024, "light.shadow.method.beta_min": 0.05}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from browser import wait_for
 from PIL import Image
-from tiny import call
+from tiny import REFINED, call
 
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
@@ -28,7 +28,7 @@ from spacesim.splat.light.field import DirectionsConfig, FieldConfig, ViewAloneC
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.run import Run, load_run
-from spacesim.splat.train.config import preset
+from spacesim.splat.train.config import preset, with_settings
 
 COUNT = 150
 EARTH = Earth([0.3, 0.2, -1.0], 50.0, albedo=1.0)
@@ -77,7 +77,7 @@ def runs() -> dict[str, Run]:
     rng = np.random.default_rng(7)
     plain = Gaussians.from_numpy(ball(rng) | {"sh": rng.normal(scale=0.2, size=(COUNT, 16, 3))})
     small = {"features": 8, "width": 16}
-    shadows = preset("demo", "shadow-map").light
+    shadows = with_settings(preset("demo", "shadow-map"), REFINED).light
     assert shadows is not None
     linear = LightConfig(FieldConfig(**small, inputs=ViewAloneConfig()), linear=True, tone="filmic", exposure=0.0)
     return {

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tiny import REFINED
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere
@@ -22,7 +23,8 @@ from spacesim.splat.train.start import MANY_PICTURES, MANY_STEPS, sun_warning
 from spacesim.splat.train.train import train
 from spacesim.splat.train.views import TrainingViews
 
-CONFIG = replace(preset("demo", "shadow-map"), sun="unknown", init_count=150, iterations=20, checkpoint_every=6)
+SHADOWS = with_settings(preset("demo", "shadow-map"), REFINED)
+CONFIG = replace(SHADOWS, sun="unknown", init_count=150, iterations=20, checkpoint_every=6)
 
 
 @pytest.fixture
