@@ -26,6 +26,7 @@ from spacesim.splat.raster.records import (
     BlendResult,
     BlendState,
     ListedRecords,
+    bits_of,
     exp2,
     exponents,
     list_records,
@@ -134,7 +135,7 @@ def _walk(
     shape, turn, thread = lists.shape, TURN[select()], walks.thread
 
     def alive(k: UInt32, end: UInt32, transmittance: list[Float], _sums: object, _last: object) -> Bool:
-        return (k < end) & (reduce(and_, map(_bits, transmittance)) < SIGN)
+        return (k < end) & (reduce(and_, map(bits_of, transmittance)) < SIGN)
 
     def blend(
         k: UInt32, end: UInt32, transmittance: list[Float], sums: list[list[Float]], last: list[UInt32]
@@ -166,14 +167,9 @@ def _walk(
     return state[2:]
 
 
-def _bits(value: Float) -> UInt32:
-    """Of a number, as they are."""
-    return cast(UInt32, dr.reinterpret_array(ad.UInt32, value))
-
-
 def _negative(value: Float) -> Float:
     """-|x|."""
-    return cast(Float, dr.reinterpret_array(ad.Float, _bits(value) | SIGN))
+    return cast(Float, dr.reinterpret_array(ad.Float, bits_of(value) | SIGN))
 
 
 def _of_pixels(values: list[NumberT], lists: TileLists, walks: Walks, otherwise: int, cut: bool) -> NumberT:

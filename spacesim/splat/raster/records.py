@@ -163,6 +163,9 @@ def exp2(power: Float) -> Float:
     value = ad.Float(_EXP2[-1])
     for coefficient in _EXP2[-2::-1]:
         value = dr.fma(value, fraction, coefficient)
-    bits = cast(UInt32, dr.reinterpret_array(ad.UInt32, shifted))
-    scaled = cast(UInt32, dr.reinterpret_array(ad.UInt32, value))
-    return cast(Float, dr.reinterpret_array(ad.Float, scaled + (bits << 23)))
+    return cast(Float, dr.reinterpret_array(ad.Float, bits_of(value) + (bits_of(shifted) << 23)))
+
+
+def bits_of(value: Float) -> UInt32:
+    """Of a number, as they are: of numbers from 0 on they are in the same order."""
+    return cast(UInt32, dr.reinterpret_array(ad.UInt32, value))

@@ -15,6 +15,7 @@ from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
     ALPHA_MAX,
     POWER_MIN,
+    bits_of,
     exp2,
     exponents,
     list_records,
@@ -25,6 +26,7 @@ from spacesim.splat.raster.records import (
 )
 
 NONE = 2**32 - 1  #: in place of a splat's number
+HALF = 0x3F000000  #: the bits of 0.5
 THICKNESS = 0.05  #: of a disc, in its shorter standard deviation
 REACH = 2.0  #: standard deviations to which a Gaussian's surface reaches (docs/research/geometry.md)
 
@@ -89,25 +91,26 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
     thread, pixels = thread_pixels(lists), lists.shape.pixels
 
     def undecided(k: UInt32, end: UInt32, transmittance: list[Float], _place: object) -> Bool:
-        return (k < end) & (reduce(dr.maximum, transmittance) >= 0.5)
+        return (k < end) & (reduce(dr.maximum, map(bits_of, transmittance)) >= HALF)
 
     def pass_splat(
         k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]
     ) -> tuple[UInt32, UInt32, list[Float], list[UInt32]]:
+        """place: one past the last pair behind which half of the light passes"""
         transmittance, place = list(transmittance), list(place)
         powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
         for p in range(pixels):
-            passing = transmittance[p] >= 0.5
             drawn = dr.minimum(exp2(powers[p]), ALPHA_MAX)
             alpha = dr.select(powers[p] >= POWER_MIN, drawn, 0)
             transmittance[p] -= alpha * transmittance[p]
-            place[p] = dr.select(passing & (transmittance[p] < 0.5), k, place[p])
+            place[p] = dr.select(transmittance[p] >= 0.5, k + 1, place[p])
         return k + 1, end, transmittance, place
 
     start, end = (dr.gather(ad.UInt32, bound, thread.tile) for bound in (lists.start, lists.end))
-    state = start, end, [ad.Float(1) for _ in range(pixels)], [ad.UInt32(NONE) for _ in range(pixels)]
-    *_, place = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
-    tiled = store(list(place), thread.place, lists.tiles_x * lists.tiles_y * lists.shape.threads)
+    state = start, end, [ad.Float(1) for _ in range(pixels)], [ad.UInt32(start) for _ in range(pixels)]
+    *_, passed, place = dr.while_loop(state, undecided, pass_splat, mode="symbolic", label="median")
+    decided = [dr.select(left < 0.5, number, NONE) for left, number in zip(passed, place, strict=True)]
+    tiled = store(decided, thread.place, lists.tiles_x * lists.tiles_y * lists.shape.threads)
     dr.eval(tiled)
     place = dr.gather(ad.UInt32, tiled, tiled_index(lists, width, height))
     return dr.select(place != NONE, dr.gather(ad.UInt32, lists.splat, place, place != NONE), NONE)
