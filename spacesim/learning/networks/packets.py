@@ -1,7 +1,7 @@
 """Matrices by packets along their rows: a thread reads and writes some columns at once.
 
 On LLVM what a kernel gives as its result goes past the caches, to memory, from where the next reads it again (Dr.Jit
-1.5 stores it so); packets stay in them: two cores take a fifth less time for a layer (docs/research/speed.md).
+1.5 stores it so); packets stay in them: two cores with AVX2 take a fifth less time for a layer.
 """
 
 from typing import Any

@@ -3,7 +3,7 @@
 One thread holds a block of a tile's pixels and walks the tile's list. `forward` and `backward` are the two passes;
 `rasterize` is the differentiable operation made of them. The adjoint is by hand (`adjoint.py`): by buckets of pairs on
 CUDA, by tiles on LLVM. Buckets read what `forward` has kept of each pixel before each bucket. On an H100 to keep it
-costs a twentieth of what the adjoint gains; on a CPU it costs more than that (docs/research/speed.md).
+costs a twentieth of what the adjoint gains; on a CPU it costs more than that.
 """
 
 from collections.abc import Callable

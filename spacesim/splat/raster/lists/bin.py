@@ -5,7 +5,7 @@ scheduling. Pairs of tile and splat come from the box around a splat's ellipse; 
 in no list. How the lists are put in order depends on the backend, the order does not:
 
 - CUDA counts the pairs into their tiles and orders each list by itself (`counting.py`): a radix sort's many launches
-  cost more than its work (docs/research/speed.md), and Dr.Jit 1.5 cannot replay them.
+  cost more than its work, and Dr.Jit 1.5 cannot replay them.
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
