@@ -611,6 +611,10 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
             "--method relight --set light.shadow.bias=3",
             ["--set light.shadow.bias", "expected light.shadow to be there, found none", "relight"],
         ),
+        (
+            "--preset demo --method shadow-map --set light.shadow.refine.width=32",
+            ["expected light.shadow.refine to be there, found none; light.shadow.refine={} puts it there"],
+        ),
         ("--method relight --set visibility_weight=1", ["--set visibility_weight", "shadows", "relight"]),
         ("--method shadow-splat --set light.shadow.bias=-1", ["--set light.shadow.bias: expected 0 or more, found -1"]),
         (

@@ -350,7 +350,9 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
             if not isinstance(inner, dict):
                 first = ".".join(keys[:depth])
                 if inner is None:
-                    why = f" under the method {config.method}" if keys[0] == "light" else ""
+                    why = "" if keys[0] != "light" else f"; {first}={{}} puts it there"
+                    if first in ("light", "light.shadow"):
+                        why = f" under the method {config.method}"
                     raise InputError(f"{name}: expected {first} to be there, found none{why}")
                 raise InputError(f"{name}: expected {first} alone, which has no fields, found {name}")
             table = inner
