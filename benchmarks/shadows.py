@@ -116,13 +116,14 @@ def configurations(kind: str, size: str) -> Iterator[tuple[str, TrainConfig]]:
     yield "map, surface, offset receivers alone", with_shadow(mapped, grazing="lift")
     yield "splat, surface, offset receivers alone", with_shadow(splatted, grazing="lift")
     for name, config in (("map", mapped), ("splat", splatted)):
-        yield f"{name}, surface, no refinement", with_shadow(config, refine=None)
+        has, other = shadow_of(config).refine, refine_of(splatted)
+        yield f"{name}, surface, {'no ' if has else ''}refinement", with_shadow(config, refine=None if has else other)
     half = shadow_of(splatted).size // 2
     yield "splat, surface, light of half the size", with_shadow(splatted, size=half)
     yield "splat, surface, a quarter of the emitters", with_bounce(splatted, light_of(splatted).bounce // 4)
     yield "map, surface, percentage-closer", with_shadow(mapped, method=MappingConfig("percentage-closer"))
-    other = "median" if size == "fine" else "variance"
-    yield f"map, surface, {other}", with_settings(mapped, {"light.shadow.method": {"filter": other}})
+    blur = "median" if size == "fine" else "variance"
+    yield f"map, surface, {blur}", with_settings(mapped, {"light.shadow.method": {"filter": blur}})
     yield "none, surface, unfiltered", replace(relit, antialiased=False)
     yield "map, surface, unfiltered", replace(mapped, antialiased=False)
     yield "splat, surface, unfiltered", replace(splatted, antialiased=False)
@@ -170,7 +171,8 @@ def as_thesis(config: TrainConfig) -> TrainConfig:
     if config.light is None or config.light.shadow is None:
         return config
     printed = preset("thesis", config.method)
-    refine = replace(refine_of(printed), width=refine_of(config).width)
+    ours = config.light.shadow.refine or refine_of(preset(str(config.preset), "shadow-splat"))
+    refine = replace(refine_of(printed), width=ours.width)
     return with_shadow(config, **{**vars(shadow_of(printed)), "size": config.light.shadow.size, "refine": refine})
 
 

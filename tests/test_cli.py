@@ -613,7 +613,7 @@ def test_an_existing_empty_folder_is_taken(spacesim, tiny_data, tmp_path):
         ),
         (
             "--preset demo --method shadow-map --set light.shadow.refine.width=32",
-            ["expected light.shadow.refine to be there, found none; light.shadow.refine={} puts it there"],
+            ["expected light.shadow.refine to be there, found none; light.shadow.refine={} puts it there with its"],
         ),
         ("--method relight --set visibility_weight=1", ["--set visibility_weight", "shadows", "relight"]),
         ("--method shadow-splat --set light.shadow.bias=-1", ["--set light.shadow.bias: expected 0 or more, found -1"]),

@@ -190,13 +190,14 @@ def sphere_arrays(count: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def sphere_run(count: int, seed: int = 0) -> "Run":
-    """Such splats with features, relit and with shadows by untrained networks."""
+    """Such splats with features, relit and with shadows by untrained networks, refinement included."""
     from spacesim.splat.light.model import LightModel, TrainingFrame
     from spacesim.splat.raster.gaussians import Gaussians
     from spacesim.splat.run import Run
-    from spacesim.splat.train.config import preset
+    from spacesim.splat.train.config import preset, with_settings
 
-    config = preset("demo", "shadow-map").light
+    refine = preset("demo", "shadow-splat").to_json()["light"]["shadow"]["refine"]
+    config = with_settings(preset("demo", "shadow-map"), {"light.shadow.refine": refine}).light
     assert config is not None
     features = np.random.default_rng(seed).normal(size=(count, config.features)).astype(np.float32)
     arrays = {**sphere_arrays(count, seed), "sh": np.zeros((count, 0, 3)), "features": features}

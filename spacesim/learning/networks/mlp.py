@@ -41,7 +41,8 @@ def forward(
 ) -> tuple[list[Float], MlpTape]:
     """(outputs, [N] each, the tape that `backward` wants): ReLU between layers, nothing after the last.
 
-    weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere;
+    weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere, m a
+    multiple of 8, on CUDA of 128;
     shared: Float [shared];  first_layer: where there is some, items are the other inputs alone, and the tape is of no
     use;  input_layer: of the tape of other items with the same weights, and what they share
     """

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Float, TensorXf
+from spacesim.backend.arrays import Float, TensorXf, UInt32
 
 SIZE = {"cuda": 4, "llvm": 8}  #: columns that a thread reads at once
 
@@ -18,17 +18,20 @@ class Packets:
     """The numbers of B matrices [C, m] by packets along their columns, a thread each.
 
     shape: (B, C, m), m a multiple of `size`, the columns of a packet
+
+    Of each thread `matrix` and `row` say where its packet is, `within` which of the row's it is.
     """
 
     def __init__(self, shape: tuple[int, ...], size: int) -> None:
         matrices, rows, m = shape
+        assert m % size == 0, "packets are whole"
         self.shape, self.size, self._across = shape, size, m // size
         self._entry = dr.arange(ad.UInt32, matrices * rows * self._across)
         self.matrix, self.within = self._entry // (rows * self._across), self._entry % self._across
         self.row = self._entry // self._across % rows
 
     def load(self, values: TensorXf) -> Any:
-        """Of a TensorXf [B, C, m]: an array of `size` Floats."""
+        """Of a TensorXf [B, C, m]: `size` Floats, an Array4f or an ArrayXf."""
         return self._gather(values, self._entry)
 
     def load_row(self, values: TensorXf, row: int) -> Any:
@@ -42,8 +45,8 @@ class Packets:
         dr.scatter(numbers, values, self._entry, mode=dr.ReduceMode.NoConflicts)
         return ad.TensorXf(numbers, self.shape)
 
-    def _gather(self, values: TensorXf, index: Any) -> Any:
-        if self.size == SIZE["cuda"]:
+    def _gather(self, values: TensorXf, index: UInt32) -> Any:
+        if self.size == 4:
             return dr.gather(ad.Array4f, values.array, index)
         return dr.gather(ad.ArrayXf, values.array, index, shape=(self.size, dr.width(index)))
 

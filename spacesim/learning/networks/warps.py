@@ -9,8 +9,8 @@ from spacesim.learning.networks.network import MlpShape, WayBack, product
 from spacesim.learning.networks.packets import Packets
 
 WARP = 32  #: threads that sum up together
-FOUR = 4  #: columns that a thread reads at once
-COLUMNS = FOUR * WARP  #: of a matrix that they sum up, of which there are a multiple
+PACKET = 4  #: columns that a thread reads at once
+COLUMNS = PACKET * WARP  #: of a matrix that they sum up, of which there are a multiple
 GROUPS = 8  #: of matrices that are summed up at the same time
 FEW = 4  #: rows of a matrix at which products by tiles are slow
 
@@ -40,7 +40,7 @@ class WarpSums:
 
     def of_rows(self, values: TensorXf) -> int:
         """The first of the rows that are those of an evaluated TensorXf [B, C, m]."""
-        at, first = Packets(values.shape, FOUR), self.take(values.shape[1])
+        at, first = Packets(values.shape, PACKET), self.take(values.shape[1])
         self.add(at.load(values), at, first + at.row)
         return first
 
@@ -96,7 +96,7 @@ def backward(way: WayBack, sums: WarpSums) -> tuple[list[Part], TensorXf]:
     by_bias: int | None = None
     for i in reversed(range(1, shape.layers)):
         rows, columns = shape.sizes[i]
-        at, weights = Packets(values[i].shape, FOUR), way.weights[1 + 2 * i]
+        at, weights = Packets(values[i].shape, PACKET), way.weights[1 + 2 * i]
         if is_few(rows):
             few, first = [at.load_row(gradient, row) for row in range(rows)], sums.take(rows * columns)
             before = ad.Array4f(0)

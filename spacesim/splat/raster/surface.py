@@ -96,7 +96,8 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
     def pass_splat(
         k: UInt32, end: UInt32, transmittance: list[Float], place: list[UInt32]
     ) -> tuple[UInt32, UInt32, list[Float], list[UInt32]]:
-        """place: one past the last pair behind which half of the light passes"""
+        """place: one past the last pair behind which half of the light passes; alphas are from 0 to `ALPHA_MAX`, so
+        none follows it"""
         transmittance, place = list(transmittance), list(place)
         powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
         for p in range(pixels):

@@ -35,7 +35,7 @@ class Walks:
     transmittance: list[Float]  #: before the walk; negative of pixels that are finished
     sums: list[list[Float]]  #: C of each pixel, before the walk
     last: UInt32  #: one past the last pair blended before the walk, or more
-    finishes: list[Bool]  #: pixels that may be finished within the walk
+    finishes: list[Bool]  #: pixels that may be finished within the walk, all that are finished before it among them
     writes: list[Bool]  #: pixels whose state after the walk is that of the whole list
 
 

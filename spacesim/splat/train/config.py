@@ -350,7 +350,7 @@ def with_settings(config: TrainConfig, settings: JsonMapping) -> TrainConfig:
             if not isinstance(inner, dict):
                 first = ".".join(keys[:depth])
                 if inner is None:
-                    why = "" if keys[0] != "light" else f"; {first}={{}} puts it there"
+                    why = "" if keys[0] != "light" else f"; {first}={{}} puts it there with its defaults"
                     if first in ("light", "light.shadow"):
                         why = f" under the method {config.method}"
                     raise InputError(f"{name}: expected {first} to be there, found none{why}")
