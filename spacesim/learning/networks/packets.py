@@ -9,7 +9,8 @@ from typing import Any
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Float, TensorXf, UInt32
+from spacesim.backend.arrays import Float, TensorXf
+from spacesim.backend.packet import gather_packet
 
 SIZE = {"cuda": 4, "llvm": 8}  #: columns that a thread reads at once
 
@@ -32,11 +33,12 @@ class Packets:
 
     def load(self, values: TensorXf) -> Any:
         """Of a TensorXf [B, C, m]: `size` Floats, an Array4f or an ArrayXf."""
-        return self._gather(values, self._entry)
+        return gather_packet(values.array, self._entry, self.size)
 
     def load_row(self, values: TensorXf, row: int) -> Any:
         """What stands above or below in a row of a TensorXf [B, any, m]."""
-        return self._gather(values, (self.matrix * values.shape[1] + row) * self._across + self.within)
+        place = (self.matrix * values.shape[1] + row) * self._across + self.within
+        return gather_packet(values.array, place, self.size)
 
     def store(self, values: Any) -> TensorXf:
         """TensorXf [B, C, m]."""
@@ -44,11 +46,6 @@ class Packets:
         numbers = dr.empty(ad.Float, matrices * rows * m)
         dr.scatter(numbers, values, self._entry, mode=dr.ReduceMode.NoConflicts)
         return ad.TensorXf(numbers, self.shape)
-
-    def _gather(self, values: TensorXf, index: UInt32) -> Any:
-        if self.size == 4:
-            return dr.gather(ad.Array4f, values.array, index)
-        return dr.gather(ad.ArrayXf, values.array, index, shape=(self.size, dr.width(index)))
 
 
 def activated(values: TensorXf, bias: Float) -> TensorXf:

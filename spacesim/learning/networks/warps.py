@@ -6,10 +6,10 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array4f, Bool, Float, TensorXf, UInt32
 from spacesim.learning.networks.joined import Joined, is_within
 from spacesim.learning.networks.network import MlpShape, WayBack, product
-from spacesim.learning.networks.packets import Packets
+from spacesim.learning.networks.packets import SIZE, Packets
 
 WARP = 32  #: threads that sum up together
-PACKET = 4  #: columns that a thread reads at once
+PACKET = SIZE["cuda"]
 COLUMNS = PACKET * WARP  #: of a matrix that they sum up, of which there are a multiple
 GROUPS = 8  #: of matrices that are summed up at the same time
 FEW = 4  #: rows of a matrix at which products by tiles are slow

@@ -8,6 +8,7 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import ArrayXf, Bool, Float, NumberT, UInt32
+from spacesim.backend.packet import gather_packet
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
 
@@ -132,10 +133,8 @@ def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool 
             place = index * (count // size) + part
             if size == 1:
                 values.append(dr.gather(ad.Float, array, place, active))
-            elif size == 8:
-                values += list(dr.gather(ad.ArrayXf, array, place, active, shape=(size, dr.width(index))))
             else:
-                values += list(dr.gather(ad.Array4f if size == 4 else ad.Array2f, array, place, active))
+                values += list(gather_packet(array, place, size, active))
     return values
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.packet import gather_packet
 from spacesim.backend.upload import upload
 from spacesim.splat.raster.records import packet
 
@@ -70,7 +71,7 @@ def load(arrays: list[Float], layout: tuple[PackedArray, ...], index: UInt32) ->
     numbers: list[Float] = []
     for array, pack in zip(arrays, layout, strict=True):
         for size, first in pack.packets():
-            numbers += _gather(array, index + first, size)
+            numbers += list(gather_packet(array, index + first, size))
     return numbers[::2], numbers[1::2]
 
 
@@ -121,10 +122,3 @@ def release(before: int, after: int) -> None:
     `before`: Dr.Jit keeps freed arrays by their size, and nothing would ever use those again."""
     if (before - 1).bit_length() != (after - 1).bit_length():
         dr.flush_malloc_cache()
-
-
-def _gather(array: Float, index: UInt32, size: int) -> list[Float]:
-    """A packet of `size` numbers."""
-    if size == 8:
-        return list(dr.gather(ad.ArrayXf, array, index, shape=(size, dr.width(index))))
-    return list(dr.gather(ad.Array4f if size == 4 else ad.Array2f, array, index))
