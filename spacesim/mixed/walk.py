@@ -12,6 +12,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.packet import load, packets, store
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import (
@@ -21,10 +22,7 @@ from spacesim.splat.raster.records import (
     ListedRecords,
     exp2,
     list_records,
-    load,
     pack_records,
-    packets,
-    store,
 )
 
 OF_SPLAT = 6  #: numbers of a splat's record before its depth and its features

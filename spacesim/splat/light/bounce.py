@@ -11,11 +11,11 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.packet import load, packet
 from spacesim.learning.networks.network import sigmoid
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.surroundings import Surroundings, ray_count
-from spacesim.splat.raster.records import load, packet
 from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27

@@ -14,8 +14,8 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.packet import load, packets, store
 from spacesim.splat.raster.lists.tiles import round_capacity
-from spacesim.splat.raster.records import load, packets, store
 
 MISSED = 0xFFFFFFFF  #: in place of a disc's number
 MOST_CELLS = 160  #: along the longest side

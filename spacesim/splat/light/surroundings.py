@@ -17,12 +17,12 @@ from scipy.spatial import cKDTree
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
 from spacesim.backend.memory import check_free_memory
+from spacesim.backend.packet import packets, store
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.learning.reflectance import unit_normals
 from spacesim.splat.light.disc_grid import MISSED, DiscGrid
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
-from spacesim.splat.raster.records import packets, store
 
 #: steps of training after which rays are traced anew: the first, then each so many, and from `EARLY` on each so many
 FIRST, OFTEN, EARLY, RARELY = 50, 100, 1000, 500

@@ -17,22 +17,11 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.packet import load, packet, packet_sizes, packets, store
 from spacesim.splat.raster.lists.pieces import count_pieces, read_pieces
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import (
-    ALPHA_MAX,
-    LOG2_E,
-    POWER_MIN,
-    BlendState,
-    exp2,
-    exponents,
-    load,
-    packet,
-    packet_sizes,
-    packets,
-    store,
-)
+from spacesim.splat.raster.records import ALPHA_MAX, LOG2_E, POWER_MIN, BlendState, exp2, exponents
 
 COPIES_BYTES = 2**30  #: that copies of gradient slots, one a CPU thread, may take
 PACKET = 4  #: SIMD lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple

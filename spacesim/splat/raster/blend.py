@@ -15,6 +15,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, NumberT, UInt32
+from spacesim.backend.packet import store
 from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
 from spacesim.splat.raster.lists.pieces import count_pieces, name_tiles
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets
@@ -31,7 +32,6 @@ from spacesim.splat.raster.records import (
     exponents,
     list_records,
     pack_records,
-    store,
 )
 from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lists
 

@@ -7,8 +7,8 @@ from typing import cast
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import ArrayXf, Bool, Float, NumberT, UInt32
-from spacesim.backend.packet import gather_packet
+from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.packet import load, packets, store
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
 
@@ -18,7 +18,6 @@ TRANSMITTANCE_MIN = 1e-4  #: a pixel is finished before the first splat behind w
 #: splats from which on records are copied in the lists' order first; of fewer threads read them by the splats' numbers:
 #: 9 % less of a frame on an H100, 4 % more on two cores; a million are more than the device's cache holds
 IN_ORDER = {"cuda": 2**19, "llvm": 0}
-PACKETS = {"cuda": (1, 2, 4), "llvm": (2, 4, 8)}  #: numbers that a thread reads or adds at once
 LOG2_E = 1.4426950408889634
 
 _EXP2 = (1.0, 0.693147004, 0.240222469, 0.0555071086, 0.00967129413, 0.00132695748)
@@ -86,56 +85,6 @@ def list_records(packed: list[Float], lists: TileLists, capacity: int) -> Listed
     ordered = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in packed]
     dr.eval(ordered)
     return ListedRecords(ordered, capacity)
-
-
-def packet_sizes(numbers: int) -> list[int]:
-    """How so many numbers of an entry are divided among arrays, in each of which those of an entry stand side by side:
-    a thread reads or adds a packet at once. On LLVM one of eight numbers costs little more than one of four."""
-    sizes = PACKETS[select()]
-    rest = numbers % sizes[-1]
-    return [sizes[-1]] * (numbers // sizes[-1]) + ([next(size for size in sizes if size >= rest)] if rest else [])
-
-
-def packets(values: list[Float]) -> list[list[Float]]:
-    """Values by `packet_sizes`, the last filled up with zeros."""
-    filled, done = [], 0
-    for size in packet_sizes(len(values)):
-        packet = values[done : done + size]
-        filled.append(packet + [ad.Float(0)] * (size - len(packet)))
-        done += size
-    return filled
-
-
-def store(values: list[NumberT], index: UInt32, size: int) -> NumberT:
-    """A flat array [size * len(values)] in which `values` of an element stand at its index, by one packet scatter."""
-    array_type = type(values[0])
-    target = dr.empty(array_type, len(values) * size)
-    if len(values) == 1:
-        dr.scatter(target, values[0], index)
-        return target
-    dr.scatter(target, (ad.ArrayXu if array_type is ad.UInt32 else ad.ArrayXf)(values), index)
-    return target
-
-
-def packet(values: list[Float]) -> ArrayXf | Float:
-    """Values of an entry as one array, to be stored or added at once."""
-    kinds = {2: ad.Array2f, 4: ad.Array4f}
-    return values[0] if len(values) == 1 else kinds.get(len(values), ad.ArrayXf)(values)
-
-
-def load(arrays: list[Float], index: UInt32, capacity: int, active: Bool | bool = True) -> list[Float]:
-    """The numbers of entry `index` of arrays of `capacity` entries; 0 where not `active`."""
-    values: list[Float] = []
-    for array in arrays:
-        count = dr.width(array) // capacity
-        size = packet_sizes(count)[-1]
-        for part in range(count // size):
-            place = index * (count // size) + part
-            if size == 1:
-                values.append(dr.gather(ad.Float, array, place, active))
-            else:
-                values += list(gather_packet(array, place, size, active))
-    return values
 
 
 def exponents(record: list[Float], px: Float, py: Float, shape: TileShape) -> list[Float]:

@@ -8,22 +8,12 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32, UInt64
+from spacesim.backend.packet import load, packets, store
 from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_pixels, tiled_index
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import (
-    ALPHA_MAX,
-    POWER_MIN,
-    bits_of,
-    exp2,
-    exponents,
-    list_records,
-    load,
-    pack_records,
-    packets,
-    store,
-)
+from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, bits_of, exp2, exponents, list_records, pack_records
 
 NONE = 2**32 - 1  #: in place of a splat's number
 HALF = 0x3F000000  #: the bits of 0.5

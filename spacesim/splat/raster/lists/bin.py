@@ -15,6 +15,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import UInt32
+from spacesim.backend.packet import load
 from spacesim.backend.upload import held
 from spacesim.splat.raster.lists.boxes import Boxes, Grid, find_boxes, packed, tile_of_pair
 from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent
@@ -22,7 +23,6 @@ from spacesim.splat.raster.lists.counting import count_boxes, count_lists
 from spacesim.splat.raster.lists.sort import segment_ids
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import Footprints, Splats
-from spacesim.splat.raster.records import load
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long

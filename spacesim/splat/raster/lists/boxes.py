@@ -8,9 +8,9 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
+from spacesim.backend.packet import packets, store
 from spacesim.splat.raster.lists.tiles import TileShape, tile_shape
 from spacesim.splat.raster.project import ALPHA_MIN, Footprints, Splats
-from spacesim.splat.raster.records import packets, store
 
 ROUNDING = 4 * 2.0**-23  #: of the sum of what an ellipse's form adds up
 

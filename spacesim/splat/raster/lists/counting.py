@@ -11,12 +11,12 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, UInt32, UInt64
+from spacesim.backend.packet import load
 from spacesim.splat.raster.lists.boxes import Boxes, Grid, each_tile, find_boxes, packed
 from spacesim.splat.raster.lists.capacity import Capacities
 from spacesim.splat.raster.lists.sort import empty_entries, entry_of, list_bounds, ordered_entries
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats
-from spacesim.splat.raster.records import load
 
 MAX_LANES = 32  #: threads that share a splat's pairs: a warp
 MANY = 256  #: tiles of a box; one of more is a large splat's

@@ -14,9 +14,8 @@ import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
-from spacesim.backend.packet import gather_packet
+from spacesim.backend.packet import gather_packet, packet
 from spacesim.backend.upload import upload
-from spacesim.splat.raster.records import packet
 
 SMALL = 2**14  #: Gaussians: so few take little anyway, and each way to deal their rows is compiled on its own
 SHARES = (15, 14, 12, 8, 4, 3, 2, 1)  #: pairs of an array: few, and most near powers of two
