@@ -20,7 +20,8 @@ from support.common import camera_from, sphere_arrays
 
 VIEWS = 8
 NEVER = 10**9  #: iterations
-STILL = LearningRates(**dict.fromkeys(LearningRates.__dataclass_fields__, 1e-12))
+_SIZES: dict[str, Any] = {name: 1e-12 for name in LearningRates.__dataclass_fields__ if name != "decay"}
+STILL = LearningRates(**_SIZES)
 """Step sizes that move nothing: every step has the same work, and the splats stay those of the sphere."""
 
 

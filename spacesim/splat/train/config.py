@@ -49,8 +49,10 @@ WEIGHTS = (
 @dataclass(frozen=True)
 class LearningRates:
     """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
-    fall exponentially; that of the means is per metre of scene scale."""
+    fall as `decay` says; that of the means is per metre of scene scale."""
 
+    #: how: by the same factor each step, or as 1 - t^2 does from the start, t = 0, to the end, t = 1: larger for longer
+    decay: Literal["exponential", "quadratic"] = "exponential"
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
     log_scales: float = 5e-3  #: of the scales' logarithms
@@ -73,7 +75,14 @@ class LearningRates:
     def __post_init__(self) -> None:
         check_fields(self)
         for f in fields(self):
-            check_ranges(self, **{f.name: (0, MAX_LEARNING_RATE)})
+            if f.name != "decay":
+                check_ranges(self, **{f.name: (0, MAX_LEARNING_RATE)})
+
+    def between(self, start: float, final: float, done: float) -> float:
+        """A step size that falls from `start` to `final`, after a share `done` of the steps in which it does."""
+        if self.decay == "quadratic":
+            return final + (start - final) * (1 - done**2)
+        return float(start ** (1 - done) * final**done)
 
 
 @dataclass(frozen=True)

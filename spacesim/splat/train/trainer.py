@@ -258,7 +258,7 @@ class Trainer(TrainingLoop):
 
     def _step_light(self, light: LightModel, results: list[ViewResult]) -> None:
         optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
-        rate = rates.networks ** (1 - done) * rates.networks_final**done
+        rate = rates.between(rates.networks, rates.networks_final, done)
         of_embeddings = rates.features * rate / (rates.networks or 1)  # as in Splatfacto-W it falls
         factors = ad.Float([*optimizer.corrections(), rate, *[of_embeddings for _ in light.embeddings]])
         gradients = [result.by_networks for result in results]
@@ -349,18 +349,18 @@ class Trainer(TrainingLoop):
         shape = [means] * 3 + [rates.log_scales] * 3 + [rates.quaternions] * 4 + [rates.logit_opacities]
         if self.gaussians.features is not None:
             done = index / self.config.iterations
-            return [*shape, rates.features ** (1 - done) * rates.features_final**done]
+            return [*shape, rates.between(rates.features, rates.features_final, done)]
         return shape + [rates.sh_constant] * 3 + [rates.sh_rest] * (len(self.gaussians.sh) - 3)
 
     def means_rate(self, index: int) -> float:
-        """Metres; falls exponentially over `means_steps`, which begin after a warm start that has larger ones."""
+        """Metres; falls over `means_steps`, which begin after a warm start that has larger ones."""
         rates, warm = self.config.rates, self.config.warm_start
         if self.pictures.model_stays(index):
             return 0.0
         waits = warm.steps if warm and warm.travel > 0 else 0
         steps = self.config.means_steps or self.config.iterations - waits
         done = min(max(index - waits, 0) / max(steps, 1), 1)
-        return float(self.scene_scale * rates.means ** (1 - done) * rates.means_final**done)
+        return float(self.scene_scale * rates.between(rates.means, rates.means_final, done))
 
     def _initial_light(self, dataset: Dataset) -> LightModel | None:
         """Networks in the frame of the Gaussians that training starts from."""

@@ -31,10 +31,10 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "e8c5830f504fafc1",
-    "fast": "d7135c64e2dbdabd",
-    "fine": "ce3084ef52447354",
-    "thesis": "d211ef461c15871c",
+    "demo": "0b68adb18d10864d",
+    "fast": "e00d39cad6b76f3f",
+    "fine": "8313b11fc3308c50",
+    "thesis": "15b65e4e105cd5cb",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
 HASHED = (
@@ -48,7 +48,8 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     if config.preset == "thesis":
         return thesis_as_it_was(config)
     if config.method == "vanilla":
-        return with_settings(config, {"rates.sh_rest": 1.25e-4, "antialiased": False, "surfels": False})
+        rates = {"rates.sh_rest": 1.25e-4, "rates.decay": "exponential"}
+        return with_settings(config, {**rates, "antialiased": False, "surfels": False})
     if config.method == "baseline-park":
         return with_settings(config, {"light.shadow.method.beta_min": 0.05})
     features = 16 if config.preset == "demo" else 32
@@ -60,7 +61,9 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03
     if (config.preset, config.method) == ("demo", "shadow-map"):
-        settings |= REFINED
+        settings |= {**REFINED, "iterations": 3000, "init_count": 8000, "rates.decay": "exponential"}
+        settings |= {"refinement.refine_start": 300, "refinement.refine_stop": 2000}
+        settings["refinement.split_screen_size"] = 0.06
     if config.method == "shadow-splat":  # of these the one of `fine`
         settings |= {"refinement.split_screen": "all", "refinement.split_screen_size": 0.015}
         settings |= {"light.shadow.bias": 5.0, "light.shadow.size": 1024, "light.shadow.method.beta_min": 0.05}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from spacesim.backend import recordings
+from spacesim.backend import ad, recordings
 from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
@@ -29,7 +29,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
-from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.config import LearningRates, TrainConfig, preset, with_options, with_settings
 from spacesim.splat.train.start import (
     COVER,
     RADIUS,
@@ -45,6 +45,7 @@ from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
 from spacesim.splat.train.train import train
 from spacesim.splat.train.trainer import Trainer
+from spacesim.splat.train.view_pass import ViewResult
 from spacesim.splat.train.warm_start import WarmStartConfig
 
 REFINEMENT = DensificationConfig(
@@ -527,6 +528,28 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
     first, second, both = moments(1, 0), moments(1, 1), moments(2, 0)
     assert np.abs(first - second).max() > 0.1 * np.abs(first).max()
     np.testing.assert_allclose(both, (first + second) / 2, rtol=1e-4, atol=1e-6 * np.abs(first).max())
+
+
+@pytest.mark.parametrize(("decay", "shares"), [("exponential", (1.0, 0.1, 0.01)), ("quadratic", (1.0, 0.7525, 0.01))])
+def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatch, decay, shares):
+    names = "means", "features", "networks"
+    finals = {f"rates.{name}_final": 0.01 * getattr(LearningRates(), name) for name in names}
+    config = with_settings(preset("demo", "relight"), {"rates.decay": decay, **finals})
+    trainer = Trainer(small_lit_dataset, replace(config, iterations=200, init_count=50))
+    of_networks = []
+
+    def learn(learned, moments, gradients, factors):
+        of_networks.append(float(np.array(factors)[2]))
+        return learned, *moments
+
+    monkeypatch.setattr(trainer, "_update_light", learn)
+    for index, share in zip((0, 100, 200), shares, strict=True):
+        rates, start = trainer.rates(index), config.rates
+        assert rates[0] == pytest.approx(share * start.means * trainer.scene_scale)
+        assert rates[-1] == pytest.approx(share * start.features)
+        trainer.iteration = index
+        trainer._step_light(trainer.light, [ViewResult(None, ad.Float(0))])
+        assert of_networks[-1] == pytest.approx(share * start.networks)
 
 
 def test_fully_masked_views_are_warned_of_once(small_dataset, caplog):
