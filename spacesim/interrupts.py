@@ -1,6 +1,7 @@
-"""How a command ends early: Ctrl-C at any moment, and a standard output that is full or whose reader has gone.
+"""How a command ends early: Ctrl-C at any moment, SIGTERM, by which batch systems and containers end a process, and a
+standard output that is full or whose reader has gone.
 
-`spacesim.cli` imports this first. Where the process is the command itself, Ctrl-C then ends in one sentence:
+`spacesim.cli` imports this first. Where the process is the command itself, both signals then end in one sentence:
 while modules are being imported the process ends at once (Python's exception would come out of compiled modules as some
 other error, or leave them half made), else KeyboardInterrupt is raised as usual.
 """
@@ -31,7 +32,7 @@ _ended_by: int = signal.SIGINT
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Around the work of a command: KeyboardInterrupt is raised within and Ctrl-C, where the process is the command,
-    ignored afterwards, as what is left is to report the outcome.
+    ignored afterwards, as what is left is to report the outcome; SIGTERM then ends the process.
 
     Standard output is flushed. Raises BrokenPipeError without a reader, WorkError where it is full; what has not
     been printed is lost then, so that the interpreter does not fail on it when it exits.
@@ -43,18 +44,18 @@ def interruptible() -> Iterator[None]:
     finally:
         if _is_command:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            if signal.getsignal(signal.SIGTERM) is _on_interrupt:
+                signal.signal(signal.SIGTERM, signal.SIG_DFL)
         print_output("", end="")
 
 
 @contextmanager
 def defer_interrupts() -> Iterator[Callable[[], bool]]:
-    """Around work that has something to save when Ctrl-C comes, or SIGTERM, by which batch systems and containers end
-    a process: the first makes the yielded function return True, a second one ends the work as usual. Where the
-    process is not the command, both do what they always do; one that is ignored stays so, as shells start commands with
-    `&`: Ctrl-C is not theirs."""
+    """Around work that has something to save when Ctrl-C or SIGTERM comes: the first makes the yielded function return
+    True, a second one ends the work as usual. Where the process is not the command, both do what they always do; one
+    that is ignored stays so, as shells start commands with `&`: Ctrl-C is not theirs."""
     interrupted = False
-    ends = ((signal.SIGINT, _on_interrupt), (signal.SIGTERM, signal.SIG_DFL)) if _is_command else ()
-    before = {number: handler for number, handler in ends if signal.getsignal(number) is handler}
+    ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is _on_interrupt]
 
     def ask(number: int, _frame: FrameType | None) -> None:
         nonlocal interrupted
@@ -64,10 +65,10 @@ def defer_interrupts() -> Iterator[Callable[[], bool]]:
         restore()
 
     def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number in ours:
+            signal.signal(number, _on_interrupt)
 
-    for number in before:
+    for number in ours:
         signal.signal(number, ask)
     try:
         yield lambda: interrupted
@@ -133,7 +134,9 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _on_interrupt(_signal: int, frame: FrameType | None) -> None:
+def _on_interrupt(number: int, frame: FrameType | None) -> None:
+    global _ended_by
+    _ended_by = number
     if _is_running and not _is_importing(frame):
         raise KeyboardInterrupt
     with suppress(OSError):
@@ -151,5 +154,6 @@ def _is_importing(frame: FrameType | None) -> bool:
     return False
 
 
-if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, _on_interrupt)
+for _number, _usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+    if _is_command and signal.getsignal(_number) is _usual:
+        signal.signal(_number, _on_interrupt)

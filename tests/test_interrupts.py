@@ -1,7 +1,8 @@
-"""Ctrl-C at chosen moments, and standard output that is full or closed: one sentence or none, never a traceback."""
+"""Ctrl-C and SIGTERM at chosen moments, standard output that is full or closed: one sentence, never a traceback."""
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,10 +16,12 @@ FULL = Path("/dev/full")
 NO_SPACE = f"spacesim: standard output: cannot be written ({os.strerror(errno.ENOSPC)})\n"
 
 # Runs the command as `python -m spacesim.cli` does, and presses Ctrl-C: when a module is looked for, or when a function
-# is called, for the first time or, as in "call:step:4:2", for the fourth time, twice.
+# is called, for the first time or, as in "call:step:4:2", for the fourth time, twice; "call:step:4:2:SIGTERM" sends
+# another signal.
 PRESSED = """
 import os, runpy, signal, sys, threading, time
-kind, wanted, nth, times = (sys.argv[1] + ":1:1").split(":")[:4]
+kind, wanted, *rest = sys.argv[1].split(":")
+nth, times, name = rest + ["1", "1", "SIGINT"][len(rest):]
 del sys.argv[1]
 
 calls = 0
@@ -28,7 +31,7 @@ def press():
     calls += 1
     if calls == int(nth):
         for _ in range(int(times)):
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.Signals[name])
             time.sleep(0.01)  # two that are pending at once are one
 
 class Watch:
@@ -71,13 +74,16 @@ def run(*words: object, **options) -> subprocess.CompletedProcess:
         ("import:mitsuba.mitsuba_ext", RESUMABLE),  # amid compiled modules, which wrap what is raised in them
         ("call:write_frame", RESUMABLE),  # while a thread writes
         ("call:sample_surface_points", RESUMABLE),  # when all frames are there
+        ("import:drjit:1:1:SIGTERM", RESUMABLE),
+        ("call:write_frame:1:1:SIGTERM", RESUMABLE),
     ],
 )
-def test_ctrl_c_at_any_moment_is_one_sentence(tmp_path, moment, sentence):
+def test_ctrl_c_or_sigterm_at_any_moment_is_one_sentence(tmp_path, moment, sentence):
     out = tmp_path / "data"
     done = run("-c", PRESSED, moment, "generate", "boxsat", "--out", out, *GENERATE, stdout=subprocess.PIPE)
     lines = [line for line in done.stderr.splitlines(keepends=True) if not line.startswith("generate: ")]
-    assert (done.returncode, "".join(lines), done.stdout) == (130, sentence, "")
+    code = 128 + (signal.SIGTERM if moment.endswith("SIGTERM") else signal.SIGINT)
+    assert (done.returncode, "".join(lines), done.stdout) == (code, sentence, "")
     assert not (out / "transforms.json").exists()
 
 
@@ -100,9 +106,11 @@ def test_ctrl_c_after_the_last_step_waits_for_the_model(tiny_data, tmp_path):
     assert (done.returncode, (tmp_path / "model.safetensors").exists()) == (0, True), done.stderr
 
 
-def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path):
-    done = run("-c", PRESSED, "call:counted:1:2", "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE)
-    assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, RESUMABLE)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_ctrl_c_ends_a_step_that_takes_long(tiny_data, tmp_path, number):
+    moment = f"call:counted:1:2:{number.name}"
+    done = run("-c", PRESSED, moment, "train", tiny_data, "--out", tmp_path, *TRAIN, stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (128 + number, RESUMABLE)
     assert not list(tmp_path.rglob("*.safetensors"))
 
 
