@@ -51,7 +51,8 @@ class LearningRates:
     """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
     fall as `decay` says; that of the means is per metre of scene scale."""
 
-    #: how: by the same factor each step, or as 1 - t^2 does from the start, t = 0, to the end, t = 1: larger for longer
+    #: how those of means, features and networks fall: by the same factor each step, or as 1 - t^2 from start, t = 0, to
+    #: end, t = 1: larger for longer
     decay: Literal["exponential", "quadratic"] = "exponential"
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
