@@ -32,7 +32,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 
 COMPONENTS = 16  #: a multiple of 4
 CONDITIONS = 600  #: random ones, far more than components
-SAMPLE = 2_000  #: Gaussians that components are found with
+SAMPLE = 1_000  #: Gaussians that components are found with
 NODES = (33, 5, 17)  #: of the table of cosines: sqrt(1 - n . h) and n . v in [0, 1], n . s in [-1, 1]
 SUN_SIDE = 16  #: Suns on a side of the table of directions
 DEGREE, VIEWS = 3, 32  #: its harmonics, and the views that these are fitted to
