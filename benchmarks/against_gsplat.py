@@ -137,6 +137,7 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     dataset = read_dataset(data)
     refinement = replace(GSPLAT_DEFAULTS, refine_stop=iterations // 2)
     classic = replace(preset("fast"), antialiased=False, surfels=False)
+    classic = replace(classic, rates=replace(classic.rates, decay="exponential"))
     config = with_options(classic, iterations=iterations, refinement=refinement)
     truth = [(frame.camera, load_image(dataset, frame).over(np.zeros(3))) for frame in dataset.test]
 

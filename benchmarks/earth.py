@@ -31,7 +31,7 @@ from spacesim.scenes.generation.generate import generate
 from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.scenefile import read_scene
 from spacesim.splat.run import Run
-from spacesim.splat.train.config import METHODS, preset, with_settings
+from spacesim.splat.train.config import METHODS, preset, with_options, with_settings
 
 
 def main() -> None:
@@ -63,7 +63,7 @@ def earthlit(options: argparse.Namespace) -> Dataset:
 
 def rows_of(data: Dataset, options: argparse.Namespace) -> Iterator[common.Row]:
     """Without the Earth in the model and with it."""
-    config = replace(preset(options.preset, options.method), iterations=options.iterations, seed=options.seed)
+    config = with_options(preset(options.preset, options.method), iterations=options.iterations, seed=options.seed)
     for name, earth in (("without", False), ("with", True)):
         lit = with_settings(config, {"light.earth": earth})
         run = trained(options.out / name, data, lit, name, show_progress)

@@ -52,17 +52,16 @@ def interruptible() -> Iterator[None]:
 @contextmanager
 def defer_interrupts() -> Iterator[Callable[[], bool]]:
     """Around work that has something to save when Ctrl-C or SIGTERM comes: the first makes the yielded function return
-    True, a second one ends the work as usual. Where the process is not the command, both do what they always do; one
-    that is ignored stays so, as shells start commands with `&`: Ctrl-C is not theirs."""
+    True, a second one ends the work as usual, a second SIGTERM at once. Where the process is not the command, both do
+    what they always do; one that is ignored stays so, as shells start commands with `&`: Ctrl-C is not theirs."""
     interrupted = False
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is _on_interrupt]
 
     def ask(number: int, _frame: FrameType | None) -> None:
         nonlocal interrupted
         interrupted = True
-        global _ended_by
-        _ended_by = number
         restore()
+        _note(number)
 
     def restore() -> None:
         for number in ours:
@@ -134,9 +133,16 @@ def _drop_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _on_interrupt(number: int, frame: FrameType | None) -> None:
+def _note(number: int) -> None:
+    """What has ended the command; where that is SIGTERM, another one does not wait until Python has its turn."""
     global _ended_by
     _ended_by = number
+    if number == signal.SIGTERM:
+        signal.signal(number, signal.SIG_DFL)
+
+
+def _on_interrupt(number: int, frame: FrameType | None) -> None:
+    _note(number)
     if _is_running and not _is_importing(frame):
         raise KeyboardInterrupt
     with suppress(OSError):

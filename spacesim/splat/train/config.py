@@ -51,8 +51,8 @@ class LearningRates:
     """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
     fall as `decay` says; that of the means is per metre of scene scale."""
 
-    #: how those of means, features and networks fall: by the same factor each step, or as 1 - t^2 from start, t = 0, to
-    #: end, t = 1: larger for longer
+    #: how step sizes of means, features and networks fall: by the same factor each step, or as 1 - t^2 from t = 0 at the
+    #: start to t = 1 at the end, by which they stay large for longer
     decay: Literal["exponential", "quadratic"] = "exponential"
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
@@ -80,7 +80,10 @@ class LearningRates:
                 check_ranges(self, **{f.name: (0, MAX_LEARNING_RATE)})
 
     def between(self, start: float, final: float, done: float) -> float:
-        """A step size that falls from `start` to `final`, after a share `done` of the steps in which it does."""
+        """A step size that falls from `start` to `final`, after a share `done` of the steps in which it does. What
+        starts at 0 stays there."""
+        if start == 0:
+            return 0.0
         if self.decay == "quadratic":
             return final + (start - final) * (1 - done**2)
         return float(start ** (1 - done) * final**done)

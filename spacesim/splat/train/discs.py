@@ -7,8 +7,15 @@ from spacesim.splat.raster.gaussians import Gaussians, principal_axes
 from spacesim.splat.raster.surface import unit
 
 EVERY = 100  #: steps between two turns
-BOTH_UNTIL = 2_500  #: step of the last turn of normals: later ones cost 0.1 dB in 7,000 steps, 0.5 in 20,000
+#: step of the last turn of normals, and its share of shorter trainings: later ones cost 0.1 dB in 7,000 steps, 0.5 in
+#: 20,000
+BOTH_UNTIL, BOTH_SHARE = 2_500, 5 / 6
 SHARE = 0.1  #: of the way to the other that each turns (docs/research/geometry.md)
+
+
+def turns_normals(step: int, steps: int) -> bool:
+    """Whether a turn after so many of all steps is one of normals, too."""
+    return step <= min(BOTH_UNTIL, BOTH_SHARE * steps)
 
 
 def turn_discs(gaussians: Gaussians, first: int, both: bool = True) -> None:

@@ -34,7 +34,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.train.checkpoint import FORMAT, GaussianCheckpointHeader
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.discs import BOTH_UNTIL, EVERY, turn_discs
+from spacesim.splat.train.discs import EVERY, turn_discs, turns_normals
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
@@ -152,7 +152,7 @@ class Trainer(TrainingLoop):
         """Now and then, where light has learned their normals, which without shadows stand in for these, too."""
         light, is_due = self.config.light, self.iteration % EVERY == 0
         if light and light.shadow and light.field.surface and self.config.surfels and is_due:
-            turn_discs(self.gaussians, light.field.features, both=self.iteration <= BOTH_UNTIL)
+            turn_discs(self.gaussians, light.field.features, both=turns_normals(self.iteration, self.config.iterations))
 
     def _refine(self) -> None:
         """After a step: the strategy refines the set of Gaussians, or the warm start does while it lasts."""

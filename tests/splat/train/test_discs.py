@@ -8,7 +8,7 @@ from splats import random_splats
 
 from spacesim.data.geometry import rotation_from_quaternion
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.train import trainer
+from spacesim.splat.train import discs, trainer
 from spacesim.splat.train.config import preset
 from spacesim.splat.train.discs import SHARE, turn_discs
 from spacesim.splat.train.trainer import Trainer
@@ -55,9 +55,15 @@ def test_discs_and_normals_turn_a_share_of_the_way():
         np.testing.assert_array_equal(after[name], start[name])
     alone = Gaussians.from_numpy(arrays)
     turn_discs(alone, FIRST, both=False)
-    discs = alone.to_numpy()
-    np.testing.assert_array_equal(discs["quaternions"], after["quaternions"])
-    np.testing.assert_array_equal(discs["features"], start["features"])
+    turned = alone.to_numpy()
+    np.testing.assert_array_equal(turned["quaternions"], after["quaternions"])
+    np.testing.assert_array_equal(turned["features"], start["features"])
+
+
+def test_the_last_turns_are_of_discs_alone():
+    for steps, last in ((20_000, 2_500), (7_000, 2_500), (3_000, 2_500), (2_000, 1_600), (60, 0)):
+        turns = range(0, steps + 1, discs.EVERY)
+        assert max(turn for turn in turns if discs.turns_normals(turn, steps)) == last
 
 
 @pytest.mark.parametrize(("method", "surfels"), [("shadow-map", True), ("relight", True), ("shadow-map", False)])
@@ -68,7 +74,7 @@ def test_training_draws_shape_and_light_together(small_lit_dataset, monkeypatch,
     ends = []
     for every, both_until in ((10, 60), (10, 0), (100, 60)):
         monkeypatch.setattr(trainer, "EVERY", every)
-        monkeypatch.setattr(trainer, "BOTH_UNTIL", both_until)
+        monkeypatch.setattr(discs, "BOTH_UNTIL", both_until)
         trained = Trainer(small_lit_dataset, config)
         trained.run(lambda progress: None, lambda: None)
         arrays = trained.gaussians.to_numpy()

@@ -552,6 +552,11 @@ def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatc
         assert of_networks[-1] == pytest.approx(share * start.networks)
 
 
+@pytest.mark.parametrize("decay", ["exponential", "quadratic"])
+def test_a_step_size_of_0_stays_0(decay):
+    assert {LearningRates(decay=decay).between(0.0, 1e-3, done) for done in (0, 0.5, 0.9, 1)} == {0.0}
+
+
 def test_fully_masked_views_are_warned_of_once(small_dataset, caplog):
     """Their loss is 0, whatever is drawn: as if all were well."""
     first = replace(small_dataset.train[0], distortion=(1e30, 0.0, 0.0, 0.0, 0.0))

@@ -23,8 +23,8 @@ SIDE, SIDE_OF_MANY, MANY = 32, 16, 40_000
 """Directions on a side of the maps of visibility; and of models of more than `MANY` Gaussians."""
 LEVELS = 15  #: of visibility, two maps' cells to a byte
 BOUNCE_SIDE = 8  #: directions on a side of the table of light that bounces
-#: columns of the four Suns whose mean stands for the 4 x 4 of a direction of it, one in each row: all 16 are 0.006 off
-#: (root mean square of square roots of the light), components 0.021
+#: of the 4 x 4 Suns that a direction of that table is the mean of, four are computed, one in each row: their columns.
+#: They are 0.006 off (root mean square of the light's square root), what the table's components leave out is 0.021
 STAGGERED = (1, 3, 0, 2)
 BOUNCE_COMPONENTS = 8  #: principal components of it
 

@@ -213,6 +213,7 @@ def shape_config(config: TrainConfig) -> TrainConfig:
     plain = with_options(preset(config.preset or "fast"), iterations=steps, seed=config.seed, init=config.init)
     return replace(
         plain,
+        rates=replace(plain.rates, decay=config.rates.decay),
         init_count=config.init_count,
         init_box=config.init_box,
         refine_poses=config.refine_poses,
