@@ -51,8 +51,8 @@ class LearningRates:
     """Adam's step sizes; those of the Gaussians are splatfacto's. Those of the means, the features and the networks
     fall as `decay` says; that of the means is per metre of scene scale."""
 
-    #: how step sizes of means, features and networks fall: by the same factor each step, or as 1 - t^2 from t = 0 at the
-    #: start to t = 1 at the end, by which they stay large for longer
+    #: how step sizes of means, features and networks fall: by the same factor each step, or as 1 - t^2, t from 0 at the
+    #: start to 1 at the end, by which they stay large for longer
     decay: Literal["exponential", "quadratic"] = "exponential"
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end

@@ -218,6 +218,13 @@ def test_training_warns_of_suns_that_may_be_far_off(sunless, quick, tmp_path, ca
     assert any("they may be far off" in record.getMessage() for record in caplog.records)
 
 
+def test_the_shape_comes_by_the_trainings_own_decay():
+    """Runs from before presets had another one go on."""
+    for decay in ("exponential", "quadratic"):
+        config = with_settings(preset("demo", "shadow-map"), {"sun": "unknown", "rates.decay": decay})
+        assert suns.shape_config(config).rates.decay == decay
+
+
 def test_first_suns_are_looked_for_with_the_anti_aliasing_filter(sunless, monkeypatch):
     """Small pictures of a model that was trained on large ones: 22.7 degrees off without it, 17.3 with it."""
     filters = []
