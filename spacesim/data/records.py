@@ -23,6 +23,9 @@ from spacesim.data.geometry import (
 MAX_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
 MAX_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
 MAX_FOCAL_LENGTH = 1e9  #: pixels
+#: R R^T - 1 of a pose's rotation R: up to the first R is taken as it is, up to the second, as three decimals leave it,
+#: the nearest rotation is
+EXACT, ROUNDED = 1e-6, 5e-3
 SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction: metres to it are 1.5e11
 SUN_WORDS = f"3 finite numbers, the largest of {SUN_LENGTHS[0]:g} to {SUN_LENGTHS[1]:g}"
 
@@ -54,7 +57,8 @@ def as_numbers(value: object) -> Array:
 class Camera:
     """A pinhole camera. The centre of pixel (column i, row j) is at (i + 0.5, j + 0.5)."""
 
-    world_from_camera: Array  #: [4, 4] float64, rigid, OpenCV axes (x right, y down, z forward), metres
+    #: [4, 4] float64, rigid, OpenCV axes (x right, y down, z forward), metres; of rounded numbers the nearest rotation
+    world_from_camera: Array
     width: int  #: pixels
     height: int  #: pixels
     fx: float  #: focal lengths, pixels
@@ -67,8 +71,13 @@ class Camera:
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
         rotation = pose[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if off > ROUNDED or np.linalg.det(rotation) < 0:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
+        if off > EXACT:
+            left, _, right = np.linalg.svd(rotation)
+            pose = pose.copy()
+            pose[:3, :3] = left @ right
         if not all(isinstance(side, int | np.integer) for side in (self.width, self.height)):
             raise InputError(f"camera: expected a whole number of pixels, found {self.width} x {self.height}")
         if self.width < 1 or self.height < 1:

@@ -9,6 +9,7 @@ from PIL import Image as PillowImage
 
 from spacesim.data.earth import EARTH_ALBEDO
 from spacesim.data.errors import InputError
+from spacesim.data.geometry import look_at
 from spacesim.data.images import load_image
 from spacesim.data.store import find_unreadable_files
 from spacesim.data.transforms import read_dataset
@@ -211,6 +212,16 @@ def set_pose(value):
     return lambda meta: meta["frames"][0].update(transform_matrix=value)
 
 
+def test_rotations_of_rounded_numbers_are_the_nearest(tmp_path):
+    exact = look_at([1, 2, 3], [0.2, 0, 0])
+    for decimals, off in ((3, 1e-3), (9, 1e-8)):
+        frame = {"transform_matrix": exact.round(decimals).tolist()}
+        found = read_dataset(write_folder(tmp_path / str(decimals), ["a.png"], frame=frame)).train[0].camera
+        rotation = found.opengl[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14 if decimals == 3 else 1e-8)
+        np.testing.assert_allclose(found.opengl, exact, atol=off)
+
+
 NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
@@ -235,6 +246,7 @@ NAN_POSE = [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         (lambda m: m.update(is_fisheye="yes"), "expected true or false as is_fisheye, found 'yes'"),
         (set_pose("identity"), "images/a.png: expected a transform_matrix"),
         (set_pose(np.diag([2, 2, 2, 1]).tolist()), "images/a.png: world_from_camera: expected a rotation"),
+        (set_pose(look_at([1, 2, 3], [0, 0, 0]).round(1).tolist()), "world_from_camera: expected a rotation"),
         (lambda m: m.update(fl_x=-1), "images/a.png: camera: expected focal lengths above 0"),
         (lambda m: m.update(fl_x="wide"), "expected a finite number as fl_x, found 'wide'"),
         (lambda m: m.update(cx=float("inf")), "expected a finite number as cx, found inf"),
