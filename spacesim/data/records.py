@@ -23,8 +23,8 @@ from spacesim.data.geometry import (
 MAX_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
 MAX_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
 MAX_FOCAL_LENGTH = 1e9  #: pixels
-#: R R^T - 1 of a pose's rotation R: up to the first R is taken as it is, up to the second, as three decimals leave it,
-#: the nearest rotation is
+#: of R R^T - 1 of a pose's rotation R: up to the first R is taken as it is; rounded numbers, of three decimals say, are
+#: up to the second, and the nearest rotation is taken
 EXACT, ROUNDED = 1e-6, 5e-3
 SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction: metres to it are 1.5e11
 SUN_WORDS = f"3 finite numbers, the largest of {SUN_LENGTHS[0]:g} to {SUN_LENGTHS[1]:g}"
