@@ -99,7 +99,8 @@ def test_models_of_a_scene_have_the_shapes_of_their_runs(tiny, tmp_path):
     for key in ("chamfer", "hausdorff99", "iou", "size", "accuracy"):
         assert first[key] == pytest.approx(alone.values[key], rel=1e-3)
         factor = {"chamfer": 4, "iou": 1}.get(key, 2)
-        within = 0.3 if key == "hausdorff99" else 0.15  # other views, other voxels, and one per cent of the surface
+        # other views and voxels: an IoU of 0.1 and one per cent of the surface change more by them
+        within = 0.3 if key in ("hausdorff99", "iou") else 0.15
         assert second[key] == pytest.approx(factor * first[key], rel=within), key
     assert second["floaters"]["inside"] == pytest.approx(first["floaters"]["inside"], abs=1e-3)
 
