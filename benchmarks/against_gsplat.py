@@ -33,7 +33,7 @@ from spacesim.learning.folder import TrainingProgress
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.render import render
-from spacesim.splat.train.config import TrainConfig, preset, with_options
+from spacesim.splat.train.config import TrainConfig, preset, with_options, with_settings
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.trainer import Trainer
 
@@ -136,8 +136,8 @@ def compare_training(data: Path, iterations: int) -> dict[str, Any]:
     """Train both, render the test views with both, compare with the truth over black."""
     dataset = read_dataset(data)
     refinement = replace(GSPLAT_DEFAULTS, refine_stop=iterations // 2)
-    classic = replace(preset("fast"), antialiased=False, surfels=False)
-    classic = replace(classic, rates=replace(classic.rates, decay="exponential"))
+    theirs = {"antialiased": False, "surfels": False, "rates.decay": "exponential"}
+    classic = with_settings(preset("fast"), theirs)
     config = with_options(classic, iterations=iterations, refinement=refinement)
     truth = [(frame.camera, load_image(dataset, frame).over(np.zeros(3))) for frame in dataset.test]
 

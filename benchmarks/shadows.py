@@ -166,9 +166,8 @@ def as_thesis(config: TrainConfig) -> TrainConfig:
     """The field, the shadows and the splats as the thesis has them, in networks of the preset's size."""
     config = with_settings(config, {"light.field.inputs": "directions", "light.bounce": 0})
     plain = preset(str(config.preset), "relight")  # what light with shadows has of its own
-    config = replace(config, refinement=plain.refinement, iterations=plain.iterations, init_count=plain.init_count)
-    config = replace(config, rates=plain.rates, views_per_step=1)
-    config = replace(config, antialiased=False, surfels=False, supersample=1)
+    schedule = {name: getattr(plain, name) for name in ("iterations", "init_count", "rates", "refinement")}
+    config = replace(config, **schedule, views_per_step=1, antialiased=False, surfels=False, supersample=1)
     if config.light is None or config.light.shadow is None:
         return config
     printed = preset("thesis", config.method)

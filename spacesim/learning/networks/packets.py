@@ -10,9 +10,9 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, TensorXf
-from spacesim.backend.packet import gather_packet
+from spacesim.backend.packet import PACKETS, gather_packet
 
-SIZE = {"cuda": 4, "llvm": 8}  #: columns that a thread reads at once
+SIZE = {name: sizes[-1] for name, sizes in PACKETS.items()}  #: columns that a thread reads at once
 
 
 class Packets:

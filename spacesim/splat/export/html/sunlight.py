@@ -76,7 +76,7 @@ def tabulate_sunlight(
                 reflected += light.config.sunlit_white * albedo * _earthlight(gaussians, light, sun, earth)
             if sunlight.bounced:
                 left = 1.0 if earth is None else earth.visible_sun(sun)
-                reflected += left * all_reflected * np.stack([np.array(row) for row in sunlight.bounced], axis=1)
+                reflected += left * all_reflected * np.stack([np.array(part) for part in sunlight.bounced], axis=1)
             bounced[row // blocks, column // blocks] += reflected / min(blocks**2, len(STAGGERED))
         report()
     packed = np.ascontiguousarray((levels[0::2] | levels[1::2] << 4).T) if light.config.shadow else None

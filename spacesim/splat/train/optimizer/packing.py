@@ -14,7 +14,7 @@ import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, UInt32
-from spacesim.backend.packet import gather_packet, packet
+from spacesim.backend.packet import PACKETS, gather_packet, packet
 from spacesim.backend.upload import upload
 
 SMALL = 2**14  #: Gaussians: so few take little anyway, and each way to deal their rows is compiled on its own
@@ -39,7 +39,7 @@ class PackedArray:
     def packets(self) -> Iterator[tuple[int, int]]:
         """(numbers of a packet, number of the first Gaussian's packet of that size), packet by packet. Those of all
         Gaussians stand together: pairs of rows, side by side."""
-        largest, done = 4 if select() == "cuda" else 8, 0
+        largest, done = PACKETS[select()][-1], 0
         for size in (8, 4, 2):
             while size <= largest and 2 * self.pairs - done >= size:
                 yield size, done * self.capacity // size
