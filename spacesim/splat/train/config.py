@@ -56,6 +56,8 @@ class LearningRates:
     decay: Literal["exponential", "quadratic"] = "exponential"
     means: float = 1.6e-4  #: of the centres, at the start
     means_final: float = 1.6e-6  #: of the centres, at the end
+    #: times `means` where Gaussians start on a mesh or at points, with no warm start, and poses and Suns are known
+    surface_start: float = 1.0
     log_scales: float = 5e-3  #: of the scales' logarithms
     quaternions: float = 1e-3  #: of the rotations
     logit_opacities: float = 5e-2  #: of the opacities' logits

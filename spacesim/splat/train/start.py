@@ -43,14 +43,12 @@ def initial_gaussians(
 
     With `features` > 0 they have that many, normally distributed, and no harmonics.
     init: "mesh" samples the ground-truth mesh evenly, "points" takes the dataset's points, "random" fills the cube
-    around the scene; None takes points, else the mesh, else random
+    around the scene; None: see `start_of`
     box: side of that cube in sizes of the object; None: within the cameras
     like_splatfacto: turned at random, and "random" without a box fills `SPLATFACTO_CUBE` in colours of 0.5 to 0.78
     Raises InputError where `init` is not to be had.
     """
-    rng = np.random.default_rng([seed, 0])
-    if init is None:
-        init = "points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random"
+    rng, init = np.random.default_rng([seed, 0]), start_of(dataset, init)
     if init == "points":
         means, colors = _from_points(dataset, count, rng)
     elif init == "mesh":
@@ -65,6 +63,11 @@ def initial_gaussians(
         turned = rng.standard_normal((4, gaussians.count))
         gaussians.quaternions = ad.Array4f(*map(upload, turned / np.linalg.norm(turned, axis=0)))
     return gaussians
+
+
+def start_of(dataset: Dataset, init: str | None) -> str:
+    """`init`, or the first of points, mesh, random that can be had."""
+    return init or ("points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random")
 
 
 def surface_normals(means: np.ndarray) -> np.ndarray:

@@ -41,7 +41,14 @@ from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
 from spacesim.splat.train.stages import TargetImage, update_light
-from spacesim.splat.train.start import initial_gaussians, largest_scale, lay_flat, scene_scale, surface_normals
+from spacesim.splat.train.start import (
+    initial_gaussians,
+    largest_scale,
+    lay_flat,
+    scene_scale,
+    start_of,
+    surface_normals,
+)
 from spacesim.splat.train.strategies.factory import make_strategy
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
@@ -81,6 +88,9 @@ class Trainer(TrainingLoop):
             box=config.init_box,
             like_splatfacto=config.splatfacto_start,
         )
+        learned = config.refine_poses or config.sun == "unknown" or config.warm_start is not None
+        placed = start_of(dataset, config.init) != "random" and not learned
+        self._first_means = config.rates.means * (config.rates.surface_start if placed else 1)
         self._held: list[Float] = []  # ln of metres
         if config.holds_sizes:
             share, most = config.refinement.split_screen_size, config.refinement.max_gaussians
@@ -360,7 +370,7 @@ class Trainer(TrainingLoop):
         waits = warm.steps if warm and warm.travel > 0 else 0
         steps = self.config.means_steps or self.config.iterations - waits
         done = min(max(index - waits, 0) / max(steps, 1), 1)
-        return float(self.scene_scale * rates.between(rates.means, rates.means_final, done))
+        return float(self.scene_scale * rates.between(self._first_means, rates.means_final, done))
 
     def _initial_light(self, dataset: Dataset) -> LightModel | None:
         """Networks in the frame of the Gaussians that training starts from."""

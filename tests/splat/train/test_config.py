@@ -31,10 +31,10 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "0b68adb18d10864d",
-    "fast": "e00d39cad6b76f3f",
-    "fine": "8313b11fc3308c50",
-    "thesis": "15b65e4e105cd5cb",
+    "demo": "71a806102d92950e",
+    "fast": "4a63d2f1ddd71853",
+    "fine": "9066ebd7ba9b7d06",
+    "thesis": "831611e21661271b",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
 HASHED = (
@@ -57,6 +57,7 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     if config.method in ("shadow-map", "shadow-splat"):
         fine = {"supersample": 2, "light.bounce": 1024, "iterations": 20_000, "refinement.prune_opacity": 0.005}
         settings |= {"views_per_step": 1, "light.gloss": False, "refinement.max_gaussians": 250_000}
+        settings["rates.surface_start"] = 1.0
         settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03

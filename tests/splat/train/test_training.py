@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 import shutil
 import subprocess
@@ -29,7 +30,7 @@ from spacesim.splat.raster.render import render
 from spacesim.splat.run import load_run
 from spacesim.splat.train import views
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
-from spacesim.splat.train.config import LearningRates, TrainConfig, preset, with_options, with_settings
+from spacesim.splat.train.config import LearningRates, TrainConfig, preset, warm_start, with_options, with_settings
 from spacesim.splat.train.start import (
     COVER,
     RADIUS,
@@ -550,6 +551,28 @@ def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatc
         trainer.iteration = index
         trainer._step_light(trainer.light, [ViewResult(None, ad.Float(0))])
         assert of_networks[-1] == pytest.approx(share * start.networks)
+
+
+def test_centres_that_start_on_the_surface_take_smaller_steps_at_first(small_lit_dataset):
+    """Not where the surface has yet to be found, nor under `mcmc`, whose noise is as large as they are."""
+    config = replace(preset("fast", "shadow-map"), init_count=20)
+    fast, share = config.rates, config.rates.surface_start
+    assert share < 1
+    for changes, first in (
+        ({"init": "points"}, share),
+        ({"init": "mesh"}, share),
+        ({}, share),
+        ({"init": "random"}, 1),
+        ({"warm_start": warm_start("fast")}, 1),
+        ({"refine_poses": True}, 1),
+        ({"rates": replace(fast, surface_start=1.0)}, 1),
+    ):
+        trainer = Trainer(small_lit_dataset, replace(config, **changes))
+        half = math.sqrt(first * fast.means * fast.means_final)
+        waits = 1_000 if "warm_start" in changes else 0
+        assert trainer.means_rate((7_000 + waits) // 2) == pytest.approx(half * trainer.scene_scale), changes
+        assert trainer.means_rate(7_000) == pytest.approx(fast.means_final * trainer.scene_scale), changes
+    assert preset("fast", "shadow-map", "mcmc").rates.surface_start == 1
 
 
 @pytest.mark.parametrize("decay", ["exponential", "quadratic"])
