@@ -49,13 +49,13 @@ def gathered(
     emitted: of `emission`, by so many `emitters`
     """
     rays, sides = ray_count(emitters), 2 * emitters
-    column, share = dr.minimum(dr.arange(ad.UInt32, batch.capacity), batch.count - 1), ad.Float(4 / rays)
+    number, share = batch.numbers(), ad.Float(4 / rays)
 
     def has_more(pair: UInt32, _sums: list[Float]) -> Bool:
         return pair < rays // 2
 
     def add(pair: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        both = dr.gather(ad.UInt32, surroundings.seen, pair * batch.count + column)
+        both = dr.gather(ad.UInt32, surroundings.seen, pair * batch.count + number)
         directions = load(surroundings.directions, pair, rays // 2)
         for half, side in enumerate((both & 0xFFFF, both >> 16)):
             light = load(emitted, side, sides, side < sides)[:3]
@@ -130,11 +130,11 @@ def emission(
 
 
 def albedo_radiance(scatterers: Scatterers, visibility: list[Float], k: UInt32, gaussians: UInt32) -> list[Float]:
-    """rho_k v_k |n_k . s| of the Gaussians k, [count], three Floats. visibility: of each Gaussian in a list, or
-    nothing for 1;  gaussians: N"""
+    """rho_k v_k |n_k . s| of the Gaussians k, [count], three Floats. visibility: theirs in a list, or nothing for 1;
+    gaussians: N"""
     seen = dr.dot(lit_normals(scatterers, k, gaussians), scatterers.sun)
-    if visibility:
-        seen *= dr.gather(ad.Float, visibility[0], k)
+    for share in visibility:
+        seen *= share
     logits = [dr.gather(ad.Float, scatterers.features, (scatterers.albedos + i) * gaussians + k) for i in range(3)]
     return [seen * sigmoid(logit) for logit in logits]
 

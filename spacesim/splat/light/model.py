@@ -144,15 +144,17 @@ class LightModel:
         picture: int | None = None,
         pairs: PairCounts = WAITING,
         earth: Earth | None = None,
+        batch: PaddedBatch | None = None,
     ) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None:
         the field does not take it. picture: number of the training picture whose embedding the field reads; None: it
-        reads the mean one. pairs: of the Sun's picture;  earth: see `encode_sun`"""
+        reads the mean one. pairs: of the Sun's picture;  earth: see `encode_sun`;  batch: of the Gaussians that have a
+        colour, others are black; None: all"""
         shadows = self.shadows(gaussians, sun, pairs)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
         terms = self._with_embedding(self.encode_sun(sun, earth), embedding)
         inputs = self._inputs(gaussians, camera, terms, shadows, self.surroundings(gaussians))
-        batch = PaddedBatch.of(gaussians.count)
+        batch = batch or PaddedBatch.of(gaussians.count)
         colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, inputs, batch, tape, picture)
 

@@ -9,13 +9,15 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, TensorXf, UInt32
 from spacesim.backend.upload import held
 from spacesim.splat.raster.lists.tiles import round_capacity
+from spacesim.splat.raster.seen import Chosen
 
 CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
 
 
 @dataclass
 class PaddedBatch:
-    """N Gaussians in `capacity` columns M >= N: matrices come in few sizes, and each is recorded once.
+    """N Gaussians in `capacity` columns M >= N: matrices come in few sizes, and each is recorded once. With `chosen`
+    the columns are these alone, M >= K, and what goes back to all Gaussians is 0 for the others.
 
     The columns of a matrix of C rows lie in B = M / m chunks of m = `CHUNK`, each a matrix of its own: TensorXf [B, C,
     m]. A sum over all columns is then B short ones, made at once, and one over these (`mlp.backward`).
@@ -28,6 +30,7 @@ class PaddedBatch:
     count: UInt32  #: UInt32 of width 1, N
     capacity: int
     room: UInt32  #: UInt32 of width 1, M where it may be no number of a kernel's text, as each would be compiled
+    chosen: Chosen | None = None  #: None: all
 
     @staticmethod
     def of(count: int, still: bool = False) -> "PaddedBatch":
@@ -35,22 +38,40 @@ class PaddedBatch:
         capacity = (count // CHUNK + 1) * CHUNK if still else round_capacity(count)
         return PaddedBatch(held(count, "columns"), capacity, held(capacity, "room"))
 
+    @staticmethod
+    def of_chosen(chosen: Chosen, among: int) -> "PaddedBatch | None":
+        """For these of N = `among` Gaussians; None where there is none. The host waits for their number."""
+        if (count := int(chosen.count[0])) == 0:
+            return None
+        capacity = round_capacity(count)
+        return PaddedBatch(held(among, "columns"), capacity, held(capacity, "room"), chosen)
+
+    @property
+    def used(self) -> UInt32:
+        """Columns that are a Gaussian's, of width 1."""
+        return self.chosen.count if self.chosen else self.count
+
     def is_real(self) -> Bool:
         """Bool [M]: whether a column is a Gaussian's."""
-        return self._column() < self.count
+        return self._column() < self.used
+
+    def numbers(self) -> UInt32:
+        """[M]: of each column's Gaussian; the last is repeated."""
+        column = dr.minimum(self._column(), self.used - 1)
+        return dr.gather(ad.UInt32, self.chosen.numbers, column) if self.chosen else column
 
     def repeat_last(self, values: Any) -> Any:
         """[N] to [M], an array or nested ones; the last is repeated."""
-        return dr.gather(type(values), values, dr.minimum(self._column(), self.count - 1))
+        return dr.gather(type(values), values, self.numbers())
 
     def pad_zeros(self, row: Float) -> Float:
         """[N] to [M], 0 beyond N."""
-        return dr.gather(ad.Float, row, self._column(), self.is_real())
+        return dr.gather(ad.Float, row, self.numbers() if self.chosen else self._column(), self.is_real())
 
     def block(self, packed: Float, first: int, rows: int) -> list[Float]:
         """Some rows of a packed array [C * N], [M] each."""
-        column = dr.minimum(self._column(), self.count - 1)
-        return [dr.gather(ad.Float, packed, (first + i) * self.count + column) for i in range(rows)]
+        number = self.numbers()
+        return [dr.gather(ad.Float, packed, (first + i) * self.count + number) for i in range(rows)]
 
     def matrix(self, rows: list[Float], height: int | None = None) -> TensorXf:
         """TensorXf [B, C, m] of rows [M], or one number for all, in one kernel. height: C, the rows that are missing
@@ -64,19 +85,27 @@ class PaddedBatch:
 
     def unpad(self, rows: list[Float], like: Float) -> list[Float]:
         """Rows [M], evaluated, to [N]. like: any array [N]."""
-        column = dr.arange(ad.UInt32, dr.width(like))
-        is_real = column < self.count
-        return [dr.select(is_real, dr.gather(ad.Float, row, column), like) for row in rows]
+        number = dr.arange(ad.UInt32, dr.width(like))
+        is_real = number < self.count
+        if self.chosen is None:
+            return [dr.select(is_real, dr.gather(ad.Float, row, number), like) for row in rows]
+        place = dr.gather(ad.UInt32, self.chosen.places, number)
+        is_chosen = place < self.chosen.count
+        return [dr.select(is_real, dr.gather(ad.Float, row, place, is_chosen), like) for row in rows]
 
     def pack(self, parts: list[tuple[TensorXf, int, int]], like: Float) -> Float:
         """Float [C * N], packed, of parts (TensorXf [B, R, m], first row, rows), one under another. like: an array."""
         place = dr.arange(ad.UInt32, dr.width(like))
         row, column = place // self.count, place % self.count
+        is_chosen = ad.Bool(True)
+        if self.chosen:
+            column = dr.gather(ad.UInt32, self.chosen.places, column)
+            is_chosen = column < self.chosen.count
         result, before = like, 0
         for columns, first, rows in parts:
             mine = (row >= before) & (row < before + rows)
             index = self._matrix_index(column, row - before + first, columns.shape[1])
-            result = dr.select(mine, dr.gather(ad.Float, columns.array, index, mine), result)
+            result = dr.select(mine, dr.gather(ad.Float, columns.array, index, mine & is_chosen), result)
             before += rows
         return result
 

@@ -50,6 +50,7 @@ from spacesim.splat.light.shadow.refine import (
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.light.surroundings import Surroundings
 from spacesim.splat.raster.cameras import Projection
+from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.raster.surface import across
 from spacesim.splat.raster.tone import decode_srgb
 
@@ -99,7 +100,8 @@ def shade(
     visibility = [1 - value for value in occlusion]
     outputs = _dimmed(inputs.sun, colors, visibility, faces)
     dr.eval(outputs, colors, occlusion, visibility, faces)
-    emitted = _emitted(config, field_weights, inputs, visibility, batch, field_tape.input_layer)
+    shares = _emitters_visibility(config, refine_weights, inputs, batch, visibility)
+    emitted = _emitted(config, field_weights, inputs, shares, batch, field_tape.input_layer)
     light = _received(config, inputs, emitted, batch, sides=True, mirrors=config.mirrors)
     scattered = _scattered(config, inputs, light[:6], light[6:], batch)
     if scattered:
@@ -158,7 +160,7 @@ def scatter_sunlight(
 ) -> tuple[list[Float], list[Float]]:
     """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
     field_weights, _ = split_weights(config, weights)
-    emitted = _emitted(config, field_weights, inputs, visibility, batch)
+    emitted = _emitted(config, field_weights, inputs, _of_emitters(inputs, visibility), batch)
     bounced = _received(config, inputs, emitted, batch, sides=True, mirrors=False)
     dr.eval(bounced)
     return batch.unpad(bounced, inputs.means.x), emitted if config.mirrors else []
@@ -309,8 +311,8 @@ def _emitted(
     batch: PaddedBatch,
     input_layer: network.InputLayer | None = None,
 ) -> list[Float]:
-    """What `emission` gives, or nothing. weights: of the field;  visibility: of each Gaussian in a list, or nothing
-    for 1;  input_layer: of the field, if it is known"""
+    """What `emission` gives, or nothing. weights: of the field;  visibility: of the emitters in a list, or nothing for
+    1;  input_layer: of the field, if it is known"""
     surroundings = inputs.surroundings
     if surroundings is None:
         return []
@@ -320,6 +322,27 @@ def _emitted(
     else:
         light = albedo_radiance(scatterers, visibility, emitters, batch.count)
     return emission(scatterers, surroundings, config.bounce, light, batch.count)
+
+
+def _of_emitters(inputs: ShadingInputs, values: list[Float]) -> list[Float]:
+    """Of arrays of all Gaussians; nothing where nothing is emitted."""
+    emitters = inputs.surroundings.emitters if inputs.surroundings else None
+    return [] if emitters is None else [dr.gather(ad.Float, array, emitters) for array in values]
+
+
+def _emitters_visibility(
+    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visible: list[Float]
+) -> list[Float]:
+    """Of the Sun, of each emitter in a list, or nothing. visible: of the batch, in which emitters may be missing"""
+    if batch.chosen is None or inputs.surroundings is None:
+        return _of_emitters(inputs, visible)
+    room = -(-config.bounce // CHUNK) * CHUNK
+    count = ad.UInt32(config.bounce)
+    emitters = Chosen(count, inputs.surroundings.emitters, count)
+    columns = PaddedBatch(batch.count, room, ad.UInt32(room), emitters)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns)
+    dr.eval(occlusion)
+    return [1 - dr.gather(ad.Float, value, dr.arange(ad.UInt32, config.bounce)) for value in occlusion]
 
 
 def _received(
@@ -368,7 +391,7 @@ def _painted(
     output, _ = mlp.forward(field.shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
     colors = [field_color(config.decoding, value) for value in output]
     for share in visibility:
-        colors = [color * dr.gather(ad.Float, share, number) for color in colors]
+        colors = [color * dr.gather(ad.Float, share, column // SIDES) for color in colors]
     light = colors if config.linear else [decode_srgb(color) for color in colors]
     dr.eval(light)
     index = SIDES * dr.arange(ad.UInt32, count)

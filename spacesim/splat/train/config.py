@@ -115,6 +115,9 @@ class TrainConfig:
     surfels: bool = False  #: Gaussians are discs; the first axis is their normal
     supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; none for `vanilla`, whose colours are fixed
+    #: Gaussians that weigh no more in any pixel of a view are black in it and learn no colour of it: their networks are
+    #: left out. Of light, on a CPU; CUDA would wait for their number
+    hidden_weight: float = 0.0
     visibility_weight: float = 0.0  #: weight in the loss: mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: weight: mean distance of the scales from a Gaussian's mean scale, per scene scale
     opacity_weight: float = 0.0  #: weight: mean opacity (`mcmc`)
@@ -155,7 +158,13 @@ class TrainConfig:
         check_ranges(self, num_downscales=(0, MOST_DOWNSCALES), resolution_schedule=(1, MAX_STEPS))
         if self.means_steps is not None:
             check_ranges(self, means_steps=(1, MAX_STEPS))
-        check_ranges(self, ssim_weight=(0, 1), seed=(0, 2**63), **{name: (0, MAX_LOSS_WEIGHT) for name in WEIGHTS})
+        check_ranges(
+            self,
+            ssim_weight=(0, 1),
+            hidden_weight=(0, 1),
+            seed=(0, 2**63),
+            **{name: (0, MAX_LOSS_WEIGHT) for name in WEIGHTS},
+        )
         if self.sun == "unknown" and not (self.light and self.light.field.knows_sun):
             raise InputError(f"sun: expected a method that takes the Sun, as shadow-map, found {self.method}")
         if self.visibility_weight > 0 and not (self.light and self.light.shadow):

@@ -10,11 +10,12 @@ from functools import lru_cache, partial
 
 import drjit as dr
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import held
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward
 from spacesim.splat.raster.cameras import pinhole_numbers
@@ -22,6 +23,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import lists_of_boxes
 from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.seen import shown_splats
 from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import TrainConfig
@@ -121,6 +123,8 @@ class ViewPass:
         self._draw = recorded(draw_view, elements=_elements)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
+        leaves_out = config.light is not None and select() == "llvm"  # CUDA would wait for the host
+        self._hidden = config.hidden_weight if leaves_out else 0.0
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -155,8 +159,14 @@ class ViewPass:
                 return RenderedView(camera, downscale, whole.radii, whole.channels, None, whole.tape)
             splats, values, radii, lists, pair_ends = self._list(asked, *listing)
             pairs.check(extent, pair_ends, expected)
+        batch: PaddedBatch | None = None
+        if self._hidden > 0:
+            if drawn is not None:
+                lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
+                drawn = None
+            batch = PaddedBatch.of_chosen(shown_splats(splats, lists, self._hidden), gaussians.count)
         of_sun = self.pairs.of_view("sun", view.index)
-        shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth) if light else None
+        shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth, batch) if light else None
         if shading:
             values["color"] = shading.colors
             if config.visibility_weight > 0 and shading.visibility is not None:

@@ -25,6 +25,7 @@ from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceConfig, ViewAloneConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
+from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
@@ -35,6 +36,7 @@ from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, gather_entries
 from spacesim.splat.raster.lists import pictures as picture_lists
 from spacesim.splat.raster.render import render, view_colors
+from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.run import Run, draw_lit, load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import METHODS, PRESETS, LearningRates, TrainConfig, preset
@@ -392,6 +394,48 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
             assert gradient[3] @ unit == pytest.approx(slope, rel=2e-3, abs=2e-3)
         assert np.abs(gradient[3]).max() > 0.01
         assert not gradient[[0, 1, 2, 4]].any(), "of the other pictures"
+
+
+def chosen(indices: np.ndarray, count: int) -> Chosen:
+    """Longer arrays than there are Gaussians, as in training."""
+    places = np.full(count + 9, count + 9, np.uint32)
+    places[indices] = np.arange(len(indices))
+    padded = np.pad(indices.astype(np.uint32), (0, count + 9 - len(indices)))
+    return Chosen(dr.opaque(ad.UInt32, len(indices)), upload(padded, ad.UInt32), upload(places, ad.UInt32))
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
+    light, rng = model(name), np.random.default_rng(2)
+    for count, some in ((37, 20), (61, 33), (61, 60), (61, 2)):  # recordings are replayed for other numbers
+        splats = gaussians(count, light.config.features, seed=count)
+        indices = np.sort(rng.choice(count, some, replace=False))
+        batch = PaddedBatch.of_chosen(chosen(indices, count), count)
+        every = light.shade(splats, eye(), SUN, picture=3, earth=EARTH)
+        these = light.shade(splats, eye(), SUN, picture=3, earth=EARTH, batch=batch)
+        gradients = np.zeros((4, count))
+        gradients[:, indices] = rng.normal(size=(4, some))
+        back = []
+        for shading in (every, these):
+            given = None if shading.visibility is None else upload(gradients[3])
+            back.append(light.adjoint(shading, [upload(row) for row in gradients[:3]], given))
+        pairs = list(zip(every.colors, these.colors, strict=True))
+        if every.visibility is not None:
+            pairs.append((every.visibility, these.visibility))
+        for whole, part in pairs:
+            expected = np.zeros(count)
+            expected[indices] = numbers(whole)[indices]
+            np.testing.assert_allclose(numbers(part), expected, atol=1e-6)
+        scale = np.abs(numbers(back[0].features)).max()
+        np.testing.assert_allclose(numbers(back[1].features), numbers(back[0].features), atol=1e-5 * scale)
+        for one, other in zip(
+            [*back[0].weights, *back[0].embeddings], [*back[1].weights, *back[1].embeddings], strict=True
+        ):
+            np.testing.assert_allclose(numbers(other), numbers(one), atol=1e-5 * max(np.abs(numbers(one)).max(), 1e-3))
+
+
+def test_no_gaussian_is_a_batch_of_all():
+    assert PaddedBatch.of_chosen(chosen(np.array([], int), 5), 5) is None
 
 
 def difference(function) -> float:

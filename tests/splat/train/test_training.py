@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from splats import random_splats
 
-from spacesim.backend import ad, recordings
+from spacesim.backend import ad, recordings, select
 from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images import load_image
@@ -551,6 +551,21 @@ def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatc
         trainer.iteration = index
         trainer._step_light(trainer.light, [ViewResult(None, ad.Float(0))])
         assert of_networks[-1] == pytest.approx(share * start.networks)
+
+
+def test_hidden_gaussians_have_no_colour_on_a_cpu(small_lit_dataset):
+    """A picture loses little by those that weigh little in it, and nothing by those that weigh nothing."""
+    config = replace(preset("fast", "shadow-map"), init_count=400, seed=2)
+
+    def losses(hidden_weight: float) -> list[float]:
+        trainer = Trainer(small_lit_dataset, replace(config, hidden_weight=hidden_weight))
+        return [float(trainer.step()[0]) for _ in range(6)]
+
+    every = losses(0)
+    assert losses(1) == every  # none is left: then all are lit
+    assert losses(1e-5) == pytest.approx(every, rel=1e-3)
+    assert losses(0.01) == pytest.approx(every, rel=0.05)
+    assert (losses(0.05) == every) == (select() == "cuda")
 
 
 def test_centres_that_start_on_the_surface_take_smaller_steps_at_first(small_lit_dataset):
