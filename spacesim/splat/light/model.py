@@ -148,8 +148,8 @@ class LightModel:
     ) -> Shading:
         """Colours of the Gaussians seen from `camera` with the Sun in the direction `sun` [3], unit, world axes; None:
         the field does not take it. picture: number of the training picture whose embedding the field reads; None: it
-        reads the mean one. pairs: of the Sun's picture;  earth: see `encode_sun`;  batch: of the Gaussians that have a
-        colour, others are black; None: all"""
+        reads the mean one. pairs: of the Sun's picture;  earth: see `encode_sun`;  batch: of the Gaussians that are
+        lit, others are black and in shadow; None: all"""
         shadows = self.shadows(gaussians, sun, pairs)
         embedding = self._mean_embedding() if picture is None else self._embedding(picture)
         terms = self._with_embedding(self.encode_sun(sun, earth), embedding)

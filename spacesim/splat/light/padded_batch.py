@@ -89,7 +89,7 @@ class PaddedBatch:
         is_real = number < self.count
         if self.chosen is None:
             return [dr.select(is_real, dr.gather(ad.Float, row, number), like) for row in rows]
-        place = dr.gather(ad.UInt32, self.chosen.places, number)
+        place = self.chosen.place_of(number)
         is_chosen = place < self.chosen.count
         return [dr.select(is_real, dr.gather(ad.Float, row, place, is_chosen), like) for row in rows]
 
@@ -99,7 +99,7 @@ class PaddedBatch:
         row, column = place // self.count, place % self.count
         is_chosen = ad.Bool(True)
         if self.chosen:
-            column = dr.gather(ad.UInt32, self.chosen.places, column)
+            column = self.chosen.place_of(column)
             is_chosen = column < self.chosen.count
         result, before = like, 0
         for columns, first, rows in parts:

@@ -338,7 +338,7 @@ def _emitters_visibility(
         return _of_emitters(inputs, visible)
     room = -(-config.bounce // CHUNK) * CHUNK
     count = ad.UInt32(config.bounce)
-    emitters = Chosen(count, inputs.surroundings.emitters, count)
+    emitters = Chosen(count, inputs.surroundings.emitters, None)
     columns = PaddedBatch(batch.count, room, ad.UInt32(room), emitters)
     occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns)
     dr.eval(occlusion)

@@ -8,7 +8,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt32
-from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
+from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, pack_records
 from spacesim.splat.raster.walks import whole_lists
@@ -19,19 +19,26 @@ class Chosen:
     """Some of N splats or Gaussians. Arrays are of length N or longer; what stands beyond has no meaning."""
 
     count: UInt32  #: UInt32 of width 1, K
-    numbers: UInt32  #: of the chosen, in order
-    places: UInt32  #: of each among the chosen, K or more where it is not one of them
+    numbers: UInt32  #: of the chosen
+    #: of each of the N among the chosen, K or more where it is not one of them; None where nobody asks
+    places: UInt32 | None
+
+    def place_of(self, number: UInt32) -> UInt32:
+        """Of `places`."""
+        assert self.places is not None, "nothing goes back from these to all"
+        return dr.gather(ad.UInt32, self.places, number)
 
 
-def shown_splats(splats: Splats, lists: TileLists, least: float) -> Chosen:
-    """Those that weigh more than `least` in some pixel."""
-    return _shown(splats, lists, least, round_capacity(dr.width(splats.x)))
+def shown_splats(splats: Splats, lists: TileLists, size: tuple[int, int], least: float) -> Chosen:
+    """Those that weigh more than `least` in some pixel, in order, among them what finishes a pixel and is not blended.
+    size: width and height of the picture"""
+    return _shown(splats, lists, size, least, round_capacity(dr.width(splats.x)))
 
 
 @recorded
-def _shown(splats: Splats, lists: TileLists, least: float, capacity: int) -> Chosen:
+def _shown(splats: Splats, lists: TileLists, size: tuple[int, int], least: float, capacity: int) -> Chosen:
     """capacity: length of the arrays"""
-    is_shown = _weighing(splats, lists, least, capacity)
+    is_shown = _weighing(splats, lists, size, least, capacity)
     places = dr.prefix_sum(is_shown)
     total = dr.gather(ad.UInt32, places, capacity - 1) + dr.gather(ad.UInt32, is_shown, capacity - 1)
     dr.eval(places, total)
@@ -42,11 +49,13 @@ def _shown(splats: Splats, lists: TileLists, least: float, capacity: int) -> Cho
     return Chosen(total, numbers, places)
 
 
-def _weighing(splats: Splats, lists: TileLists, least: float, capacity: int) -> UInt32:
+def _weighing(splats: Splats, lists: TileLists, size: tuple[int, int], least: float, capacity: int) -> UInt32:
     """1 for each splat that is shown, 0 for others, [capacity]: a walk as blending's, which ends sooner."""
     records = list_records(pack_records(splats, [], capacity), lists, capacity)
     walks, found = whole_lists(lists, 0), dr.zeros(ad.UInt32, capacity)
     thread, end = walks.thread, walks.end
+    inside = [(thread.column + i < size[0]) & (thread.row + j < size[1]) for i, j in thread_offsets(lists.shape)]
+    passed_first = [dr.select(of_picture, ad.Float(1), 0) for of_picture in inside]
 
     def alive(k: UInt32, transmittance: list[Float]) -> Bool:
         return (k < end) & reduce(or_, (passed > least for passed in transmittance))
@@ -61,6 +70,6 @@ def _weighing(splats: Splats, lists: TileLists, least: float, capacity: int) -> 
         return k + 1, [passed - weight for passed, weight in zip(transmittance, weights, strict=True)]
 
     if lists.capacity > 0:
-        dr.while_loop((walks.start, walks.transmittance), alive, pass_through, mode="symbolic", label="shown")
+        dr.while_loop((walks.start, passed_first), alive, pass_through, mode="symbolic", label="shown")
         dr.eval(found)
     return found

@@ -22,10 +22,11 @@ from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import lists_of_boxes
 from spacesim.splat.raster.lists.capacity import Extent
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.raster.seen import shown_splats
 from spacesim.splat.raster.supersample import upsampled_camera
-from spacesim.splat.train.async_lists import TrainingPairs
+from spacesim.splat.train.async_lists import TrainingPairs, ViewPairs
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
@@ -123,8 +124,9 @@ class ViewPass:
         self._draw = recorded(draw_view, elements=_elements)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
-        leaves_out = config.light is not None and select() == "llvm"  # CUDA would wait for the host
-        self._hidden = config.hidden_weight if leaves_out else 0.0
+        self._hidden = 0.0  # CUDA would wait for the host
+        if config.light and select() == "llvm":
+            self._hidden = min(config.hidden_weight, config.refinement.prune_opacity)  # a reset leaves twice as much
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -162,9 +164,9 @@ class ViewPass:
         batch: PaddedBatch | None = None
         if self._hidden > 0:
             if drawn is not None:
-                lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
-                drawn = None
-            batch = PaddedBatch.of_chosen(shown_splats(splats, lists, self._hidden), gaussians.count)
+                lists, drawn = _lists_of(drawn, extent, pairs), None
+            shown = shown_splats(splats, lists, (camera.width, camera.height), self._hidden)
+            batch = PaddedBatch.of_chosen(shown, gaussians.count)
         of_sun = self.pairs.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth, batch) if light else None
         if shading:
@@ -172,8 +174,7 @@ class ViewPass:
             if config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
         if drawn is not None:  # after shading, which needs memory of its own
-            lists = lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
-            del drawn
+            lists, drawn = _lists_of(drawn, extent, pairs), None
         tape, channels = blend_view(splats, values, lists, camera)
         return RenderedView(camera, downscale, radii, channels, shading, tape)
 
@@ -226,6 +227,11 @@ class ViewPass:
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
+
+
+def _lists_of(drawn: ViewSplats, extent: Extent, pairs: ViewPairs) -> TileLists:
+    """The host waits for how many pairs there are."""
+    return lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
 
 
 def _elements(arrays: list[Float], view: ViewRequest, *_: object) -> int:

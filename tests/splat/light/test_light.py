@@ -35,6 +35,7 @@ from spacesim.splat.raster import tone
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import Gaussians, gather_entries
 from spacesim.splat.raster.lists import pictures as picture_lists
+from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.render import render, view_colors
 from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.run import Run, draw_lit, load_run
@@ -397,17 +398,18 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
 
 
 def chosen(indices: np.ndarray, count: int) -> Chosen:
-    """Longer arrays than there are Gaussians, as in training."""
-    places = np.full(count + 9, count + 9, np.uint32)
+    """In arrays as long as training's."""
+    length = round_capacity(count)
+    places = np.full(length, length, np.uint32)
     places[indices] = np.arange(len(indices))
-    padded = np.pad(indices.astype(np.uint32), (0, count + 9 - len(indices)))
+    padded = np.pad(indices.astype(np.uint32), (0, length - len(indices)))
     return Chosen(dr.opaque(ad.UInt32, len(indices)), upload(padded, ad.UInt32), upload(places, ad.UInt32))
 
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
     light, rng = model(name), np.random.default_rng(2)
-    for count, some in ((37, 20), (61, 33), (61, 60), (61, 2)):  # recordings are replayed for other numbers
+    for count, some in ((37, 20), (61, 33), (61, 1), (1_100, 1_024), (2_100, 30)):  # recordings are replayed
         splats = gaussians(count, light.config.features, seed=count)
         indices = np.sort(rng.choice(count, some, replace=False))
         batch = PaddedBatch.of_chosen(chosen(indices, count), count)

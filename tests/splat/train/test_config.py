@@ -31,9 +31,9 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "fb9fb267f230f813",
-    "fast": "184e88341535495d",
-    "fine": "13a3612ed6b83a35",
+    "demo": "a7f87dff8698aab9",
+    "fast": "80f63ed58894ff42",
+    "fine": "cb918a10d10dbdea",
     "thesis": "edb72c435b0398fb",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
@@ -47,7 +47,6 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     """What that run has, and the preset has not."""
     if config.preset == "thesis":
         return thesis_as_it_was(config)
-    config = replace(config, hidden_weight=0.0)
     if config.method == "vanilla":
         rates = {"rates.sh_rest": 1.25e-4, "rates.decay": "exponential"}
         return with_settings(config, {**rates, "antialiased": False, "surfels": False})
@@ -58,7 +57,7 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     if config.method in ("shadow-map", "shadow-splat"):
         fine = {"supersample": 2, "light.bounce": 1024, "iterations": 20_000, "refinement.prune_opacity": 0.005}
         settings |= {"views_per_step": 1, "light.gloss": False, "refinement.max_gaussians": 250_000}
-        settings["rates.surface_start"] = 1.0
+        settings |= {"rates.surface_start": 1.0, "hidden_weight": 0.0}
         settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03

@@ -555,10 +555,12 @@ def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatc
 
 def test_hidden_gaussians_have_no_colour_on_a_cpu(small_lit_dataset):
     """A picture loses little by those that weigh little in it, and nothing by those that weigh nothing."""
-    config = replace(preset("fast", "shadow-map"), init_count=400, seed=2)
+    config = replace(preset("demo", "shadow-map"), init_count=400, seed=2)
+    assert config.hidden_weight > 0
 
-    def losses(hidden_weight: float) -> list[float]:
-        trainer = Trainer(small_lit_dataset, replace(config, hidden_weight=hidden_weight))
+    def losses(hidden_weight: float, **refinement: float) -> list[float]:
+        changed = replace(config.refinement, **{"prune_opacity": 0.4, **refinement})
+        trainer = Trainer(small_lit_dataset, replace(config, hidden_weight=hidden_weight, refinement=changed))
         return [float(trainer.step()[0]) for _ in range(6)]
 
     every = losses(0)
@@ -566,6 +568,7 @@ def test_hidden_gaussians_have_no_colour_on_a_cpu(small_lit_dataset):
     assert losses(1e-5) == pytest.approx(every, rel=1e-3)
     assert losses(0.01) == pytest.approx(every, rel=0.05)
     assert (losses(0.05) == every) == (select() == "cuda")
+    assert losses(0.05, prune_opacity=0.005) == losses(0.005), "a reset leaves opacities of twice that bound"
 
 
 def test_centres_that_start_on_the_surface_take_smaller_steps_at_first(small_lit_dataset):
