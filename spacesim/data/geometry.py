@@ -15,6 +15,10 @@ OPENCV_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0, 1.0])
 OPENCV_FROM_MITSUBA: Array = np.diag([-1.0, -1.0, 1.0, 1.0])
 """[4, 4] Mitsuba camera axes (x left, y up, z forward) to OpenCV's; its own inverse."""
 
+#: of R R^T - 1 of what is to be a rotation R: up to the first R is taken as it is; rounded numbers, of three decimals
+#: say, are up to the second, and the nearest rotation is taken
+EXACT, ROUNDED = 1e-6, 5e-3
+
 
 def normalize(vectors: ArrayLike) -> Array:
     """Unit vectors of `vectors` [..., 3]; a zero vector raises ValueError."""
@@ -108,6 +112,17 @@ def camera_that_sees(quaternion: ArrayLike, position: ArrayLike) -> Array:
     pose[:3, :3] = turn.T
     pose[:3, 3] = -(x * turn[0] + y * turn[1] + z * turn[2])  # to the bit, whatever the BLAS
     return pose
+
+
+def as_rotation(numbers: Array) -> Array | None:
+    """The rotation [3, 3] that finite numbers are or, rounded, were: as they are, or the nearest; None for others."""
+    if numbers.shape != (3, 3) or np.linalg.det(numbers) < 0:
+        return None
+    off = np.abs(numbers @ numbers.T - np.eye(3)).max()
+    if off <= EXACT:
+        return numbers
+    left, _, right = np.linalg.svd(numbers)
+    return left @ right if off <= ROUNDED else None
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:

@@ -15,6 +15,7 @@ from spacesim.data.geometry import (
     OPENCV_FROM_OPENGL,
     Array,
     angles_from_direction,
+    as_rotation,
     direction_from_angles,
     look_at,
     normalize,
@@ -23,9 +24,6 @@ from spacesim.data.geometry import (
 MAX_PIXELS = 2**27  #: of a picture: 16,384 x 8,192
 MAX_SIDE = 2**14  #: pixels of a picture's longer side: what H.264 encodes
 MAX_FOCAL_LENGTH = 1e9  #: pixels
-#: of R R^T - 1 of a pose's rotation R: up to the first R is taken as it is; rounded numbers, of three decimals say, are
-#: up to the second, and the nearest rotation is taken
-EXACT, ROUNDED = 1e-6, 5e-3
 SUN_LENGTHS = 1e-15, 1e15  #: of a vector that names the Sun's direction: metres to it are 1.5e11
 SUN_WORDS = f"3 finite numbers, the largest of {SUN_LENGTHS[0]:g} to {SUN_LENGTHS[1]:g}"
 
@@ -70,14 +68,12 @@ class Camera:
         pose = as_numbers(self.world_from_camera)
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
             raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
-        rotation = pose[:3, :3]
-        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if off > ROUNDED or np.linalg.det(rotation) < 0:
+        rotation = as_rotation(pose[:3, :3])
+        if rotation is None:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
-        if off > EXACT:
-            left, _, right = np.linalg.svd(rotation)
+        if not np.array_equal(rotation, pose[:3, :3]):
             pose = pose.copy()
-            pose[:3, :3] = left @ right
+            pose[:3, :3] = rotation
         if not all(isinstance(side, int | np.integer) for side in (self.width, self.height)):
             raise InputError(f"camera: expected a whole number of pixels, found {self.width} x {self.height}")
         if self.width < 1 or self.height < 1:

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
-from spacesim.data.geometry import Array, quaternion_from_rotation, rotation_from_quaternion
+from spacesim.data.geometry import Array, as_rotation, quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
 
 MAX_COORDINATE = 1e8  #: metres of a position at most: single precision resolves 10 m there
@@ -157,11 +157,11 @@ def _rotation(values: ArrayLike) -> tuple[Array, Array]:
             raise InputError(f"rotation_wxyz: expected 4 finite numbers, not all 0, found {values!r}")
         unit = numbers if abs(length - 1) < 1e-12 else numbers / length
         return rotation_from_quaternion(unit), unit
-    is_rotation = numbers.shape == (3, 3) and np.abs(numbers @ numbers.T - np.eye(3)).max() < 1e-3
-    if not is_rotation or np.linalg.det(numbers) < 0:
+    rotation = as_rotation(numbers)
+    if rotation is None:
         raise InputError(f"rotation: expected a rotation matrix [3, 3] or a quaternion [4], found {values!r}")
-    turned = not np.array_equal(numbers, np.eye(3))
-    return numbers, quaternion_from_rotation(numbers) if turned else np.array([1.0, 0.0, 0.0, 0.0])
+    turned = not np.array_equal(rotation, np.eye(3))
+    return rotation, quaternion_from_rotation(rotation) if turned else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def _numbers(values: ArrayLike) -> Array:

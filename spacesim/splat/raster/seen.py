@@ -16,7 +16,7 @@ from spacesim.splat.raster.walks import whole_lists
 
 @dataclass
 class Chosen:
-    """Some of N splats or Gaussians. Arrays are of length N or longer; what stands beyond has no meaning."""
+    """Some of N splats or Gaussians. Arrays may be longer; what stands beyond has no meaning."""
 
     count: UInt32  #: UInt32 of width 1, K
     numbers: UInt32  #: of the chosen

@@ -121,3 +121,14 @@ def test_what_is_no_pose_is_refused(arguments, named):
 def test_an_axis_needs_a_direction():
     with pytest.raises(InputError, match="axis"):
         rotation_about([0, 0, 0], 10)
+
+
+def test_a_rounded_rotation_is_the_nearest_one():
+    exact = Rotation.from_rotvec([0.3, -1.1, 0.6]).as_matrix()
+    for decimals, off in ((3, 1e-3), (9, 1e-8)):
+        pose = Pose(exact.round(decimals))
+        np.testing.assert_allclose(pose.rotation, exact, atol=off)
+        np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14 if decimals == 3 else 1e-8)
+    for wrong in (exact.round(1), -exact, np.diag([1.0, 1.0, 1.01])):
+        with pytest.raises(InputError, match="expected a rotation matrix"):
+            Pose(wrong)
