@@ -71,9 +71,8 @@ class Camera:
         rotation = as_rotation(pose[:3, :3])
         if rotation is None:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")
-        if not np.array_equal(rotation, pose[:3, :3]):
-            pose = pose.copy()
-            pose[:3, :3] = rotation
+        pose = pose.copy()
+        pose[:3, :3] = rotation
         if not all(isinstance(side, int | np.integer) for side in (self.width, self.height)):
             raise InputError(f"camera: expected a whole number of pixels, found {self.width} x {self.height}")
         if self.width < 1 or self.height < 1:

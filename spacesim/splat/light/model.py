@@ -26,7 +26,8 @@ from spacesim.splat.light import cooperative
 from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
-from spacesim.splat.light.shading import ShadingInputs, ShadingTape, split_weights
+from spacesim.splat.light.shading import ShadingTape, split_weights
+from spacesim.splat.light.shading_inputs import ShadingInputs
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight

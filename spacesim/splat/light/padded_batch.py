@@ -46,6 +46,12 @@ class PaddedBatch:
         capacity = round_capacity(count)
         return PaddedBatch(held(among, "columns"), capacity, held(capacity, "room"), chosen)
 
+    @staticmethod
+    def with_room_for(columns: int, count: UInt32, chosen: Chosen | None = None) -> "PaddedBatch":
+        """Of so many columns, rounded up, in a recording. count: N"""
+        capacity = -(-columns // CHUNK) * CHUNK
+        return PaddedBatch(count, capacity, ad.UInt32(capacity), chosen)
+
     @property
     def used(self) -> UInt32:
         """Columns that are a Gaussian's, of width 1."""

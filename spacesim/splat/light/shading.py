@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf, UInt32
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.learning.reflectance import surface_cosines
@@ -29,7 +29,6 @@ from spacesim.splat.light.bounce import (
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
     FieldConfig,
-    FieldInputs,
     earthlight,
     field_color,
     field_color_slope,
@@ -40,36 +39,18 @@ from spacesim.splat.light.field import (
     sun_adjoint,
     sun_facing,
 )
-from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch
+from spacesim.splat.light.padded_batch import PaddedBatch
+from spacesim.splat.light.shading_inputs import ShadingInputs
 from spacesim.splat.light.shadow.light_camera import towards_sun
 from spacesim.splat.light.shadow.refine import (
-    ShadowRefinementConfig,
-    refine_inputs,
     refine_occlusion,
 )
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
-from spacesim.splat.light.surroundings import Surroundings
-from spacesim.splat.raster.cameras import Projection
 from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.raster.surface import across
 from spacesim.splat.raster.tone import decode_srgb
 
 SIDES = 4  #: from which what bounces is seen where it comes from
-
-
-@dataclass
-class ShadingInputs:
-    """What shading depends on beside weights."""
-
-    features: Float  #: Float, packed [F * N]
-    means: Array3f  #: Array3f [3, N], metres
-    rotations_and_scales: tuple[Array4f, Array3f]  #: quaternions and log scales
-    logits: Float  #: of opacities
-    camera: Projection | None  #: None where the Sun's light alone is wanted
-    raw_shadows: list[Float]  #: occlusion, normal alignment, light extent and bias, [N] each, or nothing
-    sun: SunEncoding  #: as networks and shadows read it
-    training_frame: Float  #: Float [4], centre and scale of the training frame
-    surroundings: Surroundings | None  #: None without a bounce
 
 
 @dataclass
@@ -90,7 +71,7 @@ def shade(
 ) -> tuple[list[Float], list[Float], ShadingTape]:
     """(dimmed colours, [visibility] or [], tape)."""
     field_weights, refine_weights = split_weights(config, weights)
-    field_inputs = _field_inputs(inputs)
+    field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
     items = field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, inputs.sun.field_encoding)
@@ -122,7 +103,7 @@ def shade_picture(
     sunlight: Sunlight,
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
-    field, field_inputs = config.field, _field_inputs(inputs)
+    field, field_inputs = config.field, inputs.of_field()
     views = field_views(field, field_inputs, batch)
     if packed is None:
         assert first_layer is not None, "one of the two"
@@ -195,7 +176,7 @@ def _refine_occlusion(
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
     if not config.refine:
         return occlusion, None
-    items = _refine_items(config, config.refine, inputs, batch)
+    items = inputs.refine_items(config.refine, config.field.stored, batch)
     (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
@@ -247,9 +228,9 @@ def adjoint(
     grad_facing = [gradient * visibility for gradient in grad_shown] if config.field.surface else []
     grad_sun = []
     if by_sun:
-        grad_sun = [sun_adjoint(config.field, _field_inputs(inputs), grad_items, grad_facing, by_encoding[0], batch)]
+        grad_sun = [sun_adjoint(config.field, inputs.of_field(), grad_items, grad_facing, by_encoding[0], batch)]
     if config.field.surface:
-        field_inputs = _field_inputs(inputs)
+        field_inputs = inputs.of_field()
         parts.append((normals_adjoint(config.field, field_inputs, grad_items, grad_facing, grad_earth, batch), 0, 3))
     for of_weights, of_items in of_refinement:
         assert config.refine is not None
@@ -259,34 +240,6 @@ def adjoint(
         parts.append((batch.matrix(grad_albedo), 0, len(grad_albedo)))
     by_encoding = by_encoding if config.field.embeddings else []
     return batch.pack(parts, inputs.features), grad_weights, by_encoding, grad_sun
-
-
-def _refine_items(
-    config: LightConfig, refine: ShadowRefinementConfig, inputs: ShadingInputs, batch: PaddedBatch
-) -> TensorXf:
-    """Items of the refinement, TensorXf [B, C, m]: 4.11, lengths in training scale."""
-    x, y, z, scale = (dr.gather(ad.Float, inputs.training_frame, ad.UInt32(i)) for i in range(4))
-    per_metre = dr.rcp(scale)
-    positions = (batch.repeat_last(inputs.means) - ad.Array3f(x, y, z)) * per_metre
-    if refine.positions == "light":
-        axes = [[dr.gather(ad.Float, inputs.sun.light_axes, ad.UInt32(3 * i + j)) for j in range(3)] for i in range(3)]
-        positions = ad.Array3f([dr.dot(ad.Array3f(axis), positions) for axis in axes])
-    occlusion, alignment, thickness, bias = (batch.repeat_last(value) for value in inputs.raw_shadows)
-    features = batch.block(inputs.features, config.field.stored, refine.features)
-    info = [alignment, thickness * per_metre, bias * per_metre]
-    return batch.matrix(refine_inputs(refine, occlusion, features, positions, info), refine.shape.rows)
-
-
-def _field_inputs(inputs: ShadingInputs) -> FieldInputs:
-    assert inputs.camera is not None
-    return FieldInputs(
-        inputs.features,
-        inputs.means,
-        inputs.rotations_and_scales,
-        inputs.camera,
-        towards_sun(inputs.sun.light_axes),
-        inputs.sun.beams,
-    )
 
 
 def _scatterers(config: LightConfig, inputs: ShadingInputs) -> Scatterers:
@@ -336,10 +289,8 @@ def _emitters_visibility(
     """Of the Sun, of each emitter in a list, or nothing. visible: of the batch, in which emitters may be missing"""
     if batch.chosen is None or inputs.surroundings is None:
         return _of_emitters(inputs, visible)
-    room = -(-config.bounce // CHUNK) * CHUNK
-    count = ad.UInt32(config.bounce)
-    emitters = Chosen(count, inputs.surroundings.emitters, None)
-    columns = PaddedBatch(batch.count, room, ad.UInt32(room), emitters)
+    emitters = Chosen(ad.UInt32(config.bounce), inputs.surroundings.emitters, None)
+    columns = PaddedBatch.with_room_for(config.bounce, batch.count, emitters)
     occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns)
     dr.eval(occlusion)
     return [1 - dr.gather(ad.Float, value, dr.arange(ad.UInt32, config.bounce)) for value in occlusion]
@@ -377,8 +328,7 @@ def _painted(
     weights: of the field;  visibility, input_layer: as in `_emitted`
     """
     field, count = config.field, config.bounce
-    room = -(-SIDES * count // CHUNK) * CHUNK
-    columns = PaddedBatch(gaussians, room, ad.UInt32(room))
+    columns = PaddedBatch.with_room_for(SIDES * count, gaussians)
     column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
     number, side = dr.gather(ad.UInt32, emitters, column // SIDES), column % SIDES
     normals = lit_normals(_scatterers(config, inputs), number, gaussians)
@@ -406,7 +356,7 @@ def _scattered(
     is neither; where surfaces mirror, the six of `mirroring`, too. bounced, mirrored: six Floats [M] each, or nothing,
     before the Earth takes of them"""
     light: list[Float] = []
-    field_inputs = _field_inputs(inputs)
+    field_inputs = inputs.of_field()
     bounced, mirrored = inputs.sun.left(bounced), inputs.sun.left(mirrored)
     if bounced:
         over = is_back_side_seen(config.field, field_inputs, batch)

@@ -70,6 +70,11 @@ def start_of(dataset: Dataset, init: str | None) -> str:
     return init or ("points" if dataset.ply_file_path else "mesh" if dataset.mesh_path else "random")
 
 
+def starts_on_surface(dataset: Dataset, init: str | None, warms_up: bool) -> bool:
+    """Whether Gaussians start on the surface and stay near it. warms_up: a warm start moves them"""
+    return start_of(dataset, init) != "random" and not warms_up
+
+
 def surface_normals(means: np.ndarray) -> np.ndarray:
     """[N, 3] unit normals of the surface on which points [N, 3] lie, of either sign: the direction in which the
     `NEIGHBOURS` nearest points spread least (Hoppe et al. 1992)."""

@@ -46,7 +46,7 @@ from spacesim.splat.train.start import (
     largest_scale,
     lay_flat,
     scene_scale,
-    start_of,
+    starts_on_surface,
     surface_normals,
 )
 from spacesim.splat.train.strategies.factory import make_strategy
@@ -88,8 +88,8 @@ class Trainer(TrainingLoop):
             box=config.init_box,
             like_splatfacto=config.splatfacto_start,
         )
-        learned = config.refine_poses or config.sun == "unknown" or config.warm_start is not None
-        placed = start_of(dataset, config.init) != "random" and not learned
+        placed = starts_on_surface(dataset, config.init, config.warm_start is not None)
+        placed &= not config.refine_poses and config.sun == "given"
         self._first_means = config.rates.means * (config.rates.surface_start if placed else 1)
         self._held: list[Float] = []  # ln of metres
         if config.holds_sizes:

@@ -126,7 +126,7 @@ class ViewPass:
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._hidden = 0.0  # CUDA would wait for the host
         if config.light and select() == "llvm":
-            self._hidden = min(config.hidden_weight, config.refinement.prune_opacity)  # a reset leaves twice as much
+            self._hidden = min(config.hidden_weight, config.refinement.prune_opacity)
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(

@@ -18,7 +18,7 @@ from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.pictures.exposure import Exposures, known_gains
 from spacesim.splat.train.pictures.poses import PoseRefinement
 from spacesim.splat.train.pictures.suns import FirstSuns, SunEstimation
-from spacesim.splat.train.start import start_of
+from spacesim.splat.train.start import starts_on_surface
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss
 from spacesim.splat.train.views import TrainingView, TrainingViews
 
@@ -35,7 +35,7 @@ class LearnedPictures:
         self.frames = dataset.train
         self.poses: PoseRefinement | None = None
         if config.refine_poses:
-            anchor = start_of(dataset, config.init) != "random" and config.warm_start is None
+            anchor = starts_on_surface(dataset, config.init, config.warm_start is not None)
             self.poses = PoseRefinement(
                 dataset,
                 rate=rates.poses,
