@@ -39,12 +39,9 @@ class PaddedBatch:
         return PaddedBatch(held(count, "columns"), capacity, held(capacity, "room"))
 
     @staticmethod
-    def of_chosen(chosen: Chosen, among: int) -> "PaddedBatch | None":
-        """For these of N = `among` Gaussians; None where there is none. The host waits for their number."""
-        if (count := int(chosen.count[0])) == 0:
-            return None
-        capacity = round_capacity(count)
-        return PaddedBatch(held(among, "columns"), capacity, held(capacity, "room"), chosen)
+    def of_chosen(chosen: Chosen, room: int, among: int) -> "PaddedBatch":
+        """For these of N = `among` Gaussians, in `room` columns: of more the first ones."""
+        return PaddedBatch(held(among, "columns"), room, held(room, "room"), chosen)
 
     @staticmethod
     def with_room_for(columns: int, count: UInt32, chosen: Chosen | None = None) -> "PaddedBatch":
@@ -55,7 +52,7 @@ class PaddedBatch:
     @property
     def used(self) -> UInt32:
         """Columns that are a Gaussian's, of width 1."""
-        return self.chosen.count if self.chosen else self.count
+        return dr.minimum(self.chosen.count, self.room) if self.chosen else self.count
 
     def is_real(self) -> Bool:
         """Bool [M]: whether a column is a Gaussian's."""
@@ -96,7 +93,7 @@ class PaddedBatch:
         if self.chosen is None:
             return [dr.select(is_real, dr.gather(ad.Float, row, number), like) for row in rows]
         place = self.chosen.place_of(number)
-        is_chosen = place < self.chosen.count
+        is_chosen = place < self.used
         return [dr.select(is_real, dr.gather(ad.Float, row, place, is_chosen), like) for row in rows]
 
     def pack(self, parts: list[tuple[TensorXf, int, int]], like: Float) -> Float:
@@ -106,7 +103,7 @@ class PaddedBatch:
         is_chosen = ad.Bool(True)
         if self.chosen:
             column = self.chosen.place_of(column)
-            is_chosen = column < self.chosen.count
+            is_chosen = column < self.used
         result, before = like, 0
         for columns, first, rows in parts:
             mine = (row >= before) & (row < before + rows)

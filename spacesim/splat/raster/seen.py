@@ -10,7 +10,15 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity, thread_offsets
 from spacesim.splat.raster.project import Splats
-from spacesim.splat.raster.records import ALPHA_MAX, POWER_MIN, exp2, exponents, list_records, pack_records
+from spacesim.splat.raster.records import (
+    ALPHA_MAX,
+    POWER_MIN,
+    TRANSMITTANCE_MIN,
+    exp2,
+    exponents,
+    list_records,
+    pack_records,
+)
 from spacesim.splat.raster.walks import whole_lists
 
 
@@ -29,22 +37,29 @@ class Chosen:
         return dr.gather(ad.UInt32, self.places, number)
 
 
-def shown_splats(splats: Splats, lists: TileLists, size: tuple[int, int], least: float) -> Chosen:
-    """Those that weigh more than `least` in some pixel, in order, among them what finishes a pixel and is not blended.
-    size: width and height of the picture"""
-    return _shown(splats, lists, size, least, round_capacity(dr.width(splats.x)))
+def shown_splats(
+    splats: Splats, lists: TileLists, size: tuple[int, int], least: float, order: UInt32 | None = None
+) -> Chosen:
+    """Those that weigh more than `least` in some pixel, among them what finishes a pixel and is not blended. size:
+    width and height of the picture;  order: in which they are wanted, of all N and of the numbers up to
+    `round_capacity(N)`"""
+    return _shown(splats, lists, size, least, round_capacity(dr.width(splats.x)), order)
 
 
 @recorded
-def _shown(splats: Splats, lists: TileLists, size: tuple[int, int], least: float, capacity: int) -> Chosen:
+def _shown(
+    splats: Splats, lists: TileLists, size: tuple[int, int], least: float, capacity: int, order: UInt32 | None
+) -> Chosen:
     """capacity: length of the arrays"""
-    is_shown = _weighing(splats, lists, size, least, capacity)
-    places = dr.prefix_sum(is_shown)
-    total = dr.gather(ad.UInt32, places, capacity - 1) + dr.gather(ad.UInt32, is_shown, capacity - 1)
-    dr.eval(places, total)
-    numbers, index = dr.zeros(ad.UInt32, capacity), dr.arange(ad.UInt32, capacity)
-    dr.scatter(numbers, index, places, is_shown > 0, dr.ReduceMode.Permute)
-    places = dr.select(is_shown > 0, places, capacity)
+    is_shown, number = _weighing(splats, lists, size, least, capacity), dr.arange(ad.UInt32, capacity)
+    if order is not None:
+        is_shown, number = dr.gather(ad.UInt32, is_shown, order), order
+    before = dr.prefix_sum(is_shown)
+    total = dr.gather(ad.UInt32, before, capacity - 1) + dr.gather(ad.UInt32, is_shown, capacity - 1)
+    dr.eval(before, total)
+    numbers, places = dr.zeros(ad.UInt32, capacity), dr.empty(ad.UInt32, capacity)
+    dr.scatter(numbers, number, before, is_shown > 0, dr.ReduceMode.Permute)
+    dr.scatter(places, dr.select(is_shown > 0, before, capacity), number, mode=dr.ReduceMode.Permute)
     dr.eval(numbers, places)
     return Chosen(total, numbers, places)
 
@@ -55,16 +70,18 @@ def _weighing(splats: Splats, lists: TileLists, size: tuple[int, int], least: fl
     walks, found = whole_lists(lists, 0), dr.zeros(ad.UInt32, capacity)
     thread, end = walks.thread, walks.end
     inside = [(thread.column + i < size[0]) & (thread.row + j < size[1]) for i, j in thread_offsets(lists.shape)]
+    open_still = max(least, TRANSMITTANCE_MIN)
     passed_first = [dr.select(of_picture, ad.Float(1), 0) for of_picture in inside]
 
     def alive(k: UInt32, transmittance: list[Float]) -> Bool:
-        return (k < end) & reduce(or_, (passed > least for passed in transmittance))
+        return (k < end) & reduce(or_, (passed > open_still for passed in transmittance))
 
     def pass_through(k: UInt32, transmittance: list[Float]) -> tuple[UInt32, list[Float]]:
         powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
         weights = []
         for power, passed in zip(powers, transmittance, strict=True):
-            weights.append(dr.select(power >= POWER_MIN, dr.minimum(exp2(power), ALPHA_MAX) * passed, 0))
+            shows = (power >= POWER_MIN) & (passed > open_still)
+            weights.append(dr.select(shows, dr.minimum(exp2(power), ALPHA_MAX) * passed, 0))
         weighs = reduce(or_, (weight > least for weight in weights))
         dr.scatter(found, ad.UInt32(1), dr.gather(ad.UInt32, lists.splat, k), weighs)
         return k + 1, [passed - weight for passed, weight in zip(transmittance, weights, strict=True)]

@@ -130,5 +130,18 @@ class ViewPairs:
             self.forecast.observe(self._key(extent), pairs)
         return capacity
 
+    def room_for(self, extent: Extent, number: UInt32) -> int:
+        """Capacity for as many splats of the view's as `number` says, of width 1, 0 of none: without a wait where it is
+        expected, and then they may be more."""
+        capacity = self.forecast.capacity_for(self._key(extent)) if self.training.is_async else None
+        if capacity is not None:
+            capacity = min(capacity, extent.most)
+            self.check(extent, number, capacity)
+            return capacity
+        count = int(number[0])
+        if self.training.is_async:
+            self.forecast.observe(self._key(extent), count)
+        return round_capacity(count) if count else 0
+
     def _key(self, extent: Extent) -> Hashable:
         return self.view, extent.width, extent.height

@@ -115,9 +115,10 @@ class TrainConfig:
     surfels: bool = False  #: Gaussians are discs; the first axis is their normal
     supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; none for `vanilla`, whose colours are fixed
-    #: of methods of light, on a CPU: Gaussians that weigh no more in any pixel of a view are black and in shadow in its
-    #: step, and learn neither from it, so that networks leave them out; CUDA would wait for their number. Counts as
-    #: `refinement.prune_opacity` at most, half of what a reset of opacities leaves
+    #: of methods of light: Gaussians that weigh no more in any pixel of a view are black and in shadow in its step, and
+    #: learn neither from it, so that networks leave them out; of what weighs nothing nothing is lost. Counts as
+    #: `refinement.prune_opacity` at most, half of what a reset of opacities leaves; networks of fewer than 128 units
+    #: leave out none on CUDA, where it takes as long
     hidden_weight: float = 0.0
     visibility_weight: float = 0.0  #: weight in the loss: mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: weight: mean distance of the scales from a Gaussian's mean scale, per scene scale

@@ -44,6 +44,9 @@ from spacesim.splat.train.stages import (
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
+WIDE = (
+    128  #: units of the field's layers from which on to find Gaussians that show nothing takes less than to light them
+)
 KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
 
 
@@ -124,9 +127,7 @@ class ViewPass:
         self._draw = recorded(draw_view, elements=_elements)
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
-        self._hidden = 0.0  # CUDA would wait for the host
-        if config.light and select() == "llvm":
-            self._hidden = min(config.hidden_weight, config.refinement.prune_opacity)
+        self._hidden = _hidden_weight(config)
         self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
 
     def forward(
@@ -162,11 +163,12 @@ class ViewPass:
             splats, values, radii, lists, pair_ends = self._list(asked, *listing)
             pairs.check(extent, pair_ends, expected)
         batch: PaddedBatch | None = None
-        if self._hidden > 0:
+        if self._hidden is not None and light is not None:
             if drawn is not None:
                 lists, drawn = _lists_of(drawn, extent, pairs), None
             shown = shown_splats(splats, lists, (camera.width, camera.height), self._hidden)
-            batch = PaddedBatch.of_chosen(shown, gaussians.count)
+            room = self.pairs.of_view("shown", view.index).room_for(extent, shown.count)
+            batch = PaddedBatch.of_chosen(shown, room, gaussians.count) if room else None
         of_sun = self.pairs.of_view("sun", view.index)
         shading = light.shade(gaussians, camera, view.sun, view.index, of_sun, view.earth, batch) if light else None
         if shading:
@@ -227,6 +229,16 @@ class ViewPass:
         gradients = ViewGradients(drawn.camera, grad_splats.splats, grad_values, grad_light.features)
         learned = [*grad_light.weights, *grad_light.embeddings]
         return ViewResult(gradients, loss.value, learned, grad_light.sun[0] if by_sun else None)
+
+
+def _hidden_weight(config: TrainConfig) -> float | None:
+    """`TrainConfig.hidden_weight` as it counts; None where all Gaussians are lit."""
+    light = config.light
+    if light is None:
+        return None
+    if light.field.width < WIDE and (select() == "cuda" or config.hidden_weight == 0):
+        return None
+    return min(config.hidden_weight, config.refinement.prune_opacity)
 
 
 def _lists_of(drawn: ViewSplats, extent: Extent, pairs: ViewPairs) -> TileLists:

@@ -412,7 +412,7 @@ def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
     for count, some in ((37, 20), (61, 33), (61, 1), (1_100, 1_024), (2_100, 30)):  # recordings are replayed
         splats = gaussians(count, light.config.features, seed=count)
         indices = np.sort(rng.choice(count, some, replace=False))
-        batch = PaddedBatch.of_chosen(chosen(indices, count), count)
+        batch = PaddedBatch.of_chosen(chosen(indices, count), round_capacity(some), count)
         every = light.shade(splats, eye(), SUN, picture=3, earth=EARTH)
         these = light.shade(splats, eye(), SUN, picture=3, earth=EARTH, batch=batch)
         gradients = np.zeros((4, count))
@@ -436,8 +436,17 @@ def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
             np.testing.assert_allclose(numbers(other), numbers(one), atol=1e-5 * max(np.abs(numbers(one)).max(), 1e-3))
 
 
-def test_no_gaussian_is_a_batch_of_all():
-    assert PaddedBatch.of_chosen(chosen(np.array([], int), 5), 5) is None
+def test_of_more_chosen_gaussians_than_there_is_room_for_the_first_are_lit():
+    """The host hears of it a step later, and takes the step again."""
+    light, count = model("map"), 3_000
+    splats, few = gaussians(count, light.config.features), chosen(np.arange(1, count, 2), count)
+    batch = PaddedBatch.of_chosen(few, 1_024, count)
+    shading = light.shade(splats, eye(), SUN, batch=batch)
+    lit = numbers(shading.colors[0]) > 0
+    assert lit[1:2048:2].all()
+    assert not lit[2048:].any()
+    gradients = light.adjoint(shading, [dr.opaque(ad.Float, 1, count) for _ in range(3)])
+    assert np.isfinite(numbers(gradients.features)).all()
 
 
 def difference(function) -> float:

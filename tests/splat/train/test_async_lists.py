@@ -147,7 +147,7 @@ def test_shadows_and_networks_learn_the_same_to_the_bit(small_lit_dataset, metho
     config = replace(preset("demo", method), iterations=300, init_count=200, refinement=REFINEMENT)
     plain, losses = trained(small_lit_dataset, config, 70, Counted(()))
     free, other = trained(small_lit_dataset, config, 70, lists := Counted((select(),)))
-    assert lists.kinds == {"sun", "picture"}
+    assert lists.kinds == {"sun", "picture", "shown"}
     assert (lists.again > 10) == wrong
     assert other == losses
     check_same(plain, free)
