@@ -5,6 +5,7 @@ import numpy as np
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
+from spacesim.splat.light.surroundings import SKY
 from spacesim.splat.raster import adjoint, blend, records, walks
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.raster.lists import bin as binning
@@ -48,3 +49,13 @@ def on_screen(gradient: np.ndarray, radius: np.ndarray, visible: np.ndarray) -> 
     radii = np.where(visible, np.maximum(2.0 * np.asarray(radius), 1e-9), 0)
     across, along = (upload(np.asarray(rows, np.float32)) for rows in (gradient, np.zeros(len(radii))))
     return OnScreen(across, along, upload(np.asarray(radii, np.float32)), ad.Float([1.0, 1.0, 2.0]))
+
+
+def met_along(surroundings, count: int, rays: int) -> np.ndarray:
+    """[R, N] what the rays of N Gaussians meet, of `Surroundings.met`; SKY for nothing."""
+    met, found = np.array(surroundings.met), np.full((rays, count), SKY)
+    first, _, _, end = np.array(surroundings.bounds).reshape(4, count)
+    for number in range(count):
+        of_gaussian = met[first[number] : end[number]]
+        found[of_gaussian >> 16, number] = of_gaussian & 0xFFFF
+    return found

@@ -5,22 +5,24 @@ sees. A field that takes the cosines of one Gaussian cannot know which of its ne
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.packet import load, packet
 from spacesim.learning.networks.network import sigmoid
-from spacesim.learning.reflectance import seen_side_normals, unit_normals
+from spacesim.learning.reflectance import points_away, seen_side_normals, unit_normals
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.surroundings import Surroundings, ray_count
+from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.raster.tone import decode_srgb, decode_srgb_slope, encode_srgb_slope, encode_srgb_unclipped
 
 ALBEDO = -1.0  #: logit of the albedos at the start: 0.27
 SPECULAR = -3.0  #: logit of the specular reflectances at the start: 0.05
 ROUGHNESS = 0.15  #: GGX alpha at which surfaces mirror what others scatter (docs/research/light.md)
+TURN = {"cuda": 4, "llvm": 1}  #: rays a turn of the loop: their numbers are read at once
 GLASS = 0.04  #: specular reflectance of a glossy surface of refractive index 1.5
 
 
@@ -36,62 +38,117 @@ class Scatterers:
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-Weights = Callable[[Array3f, Float], list[Float]]
-"""How much light that comes along a ray counts: (unit direction of the ray [3, M], the angle w that it stands for over
-pi) to Floats [M]."""
+Weights = Callable[[Array3f], list[Float]]
+"""How much light that comes along a ray of this unit direction counts: Array3f [3, M] to Floats [M]."""
 
 
-def gathered(
-    surroundings: Surroundings, emitted: list[Float], emitters: int, batch: PaddedBatch, *kinds: Weights
+def received_on_sides(
+    scatterers: Scatterers, surroundings: Surroundings, emitted: list[Float], emitters: int, batch: PaddedBatch
 ) -> list[Float]:
-    """Light of what each Gaussian sees, three Floats [M], RGB, for each weight of each kind.
+    """Light that each Gaussian receives at the side to which its normal points, then at the other: RGB, Floats [M]
+    each, w cos / pi of each ray, which is 1 where the light of all around is 1. emitted: of `emission`, by so many
+    `emitters`"""
+    rays = _in_order(surroundings, batch)
+    normals, share = _normals(scatterers, rays), ad.Float(4 / ray_count(emitters))
 
-    emitted: of `emission`, by so many `emitters`
-    """
-    rays, sides = ray_count(emitters), 2 * emitters
-    number, share = batch.numbers(), ad.Float(4 / rays)
-
-    def has_more(pair: UInt32, _sums: list[Float]) -> Bool:
-        return pair < rays // 2
-
-    def add(pair: UInt32, sums: list[Float]) -> tuple[UInt32, list[Float]]:
-        both = dr.gather(ad.UInt32, surroundings.seen, pair * batch.count + number)
-        directions = load(surroundings.directions, pair, rays // 2)
-        for half, side in enumerate((both & 0xFFFF, both >> 16)):
-            light = load(emitted, side, sides, side < sides)[:3]
-            towards = ad.Array3f(directions[3 * half : 3 * half + 3])
-            weights = [weight for kind in kinds for weight in kind(towards, share)]
-            sums = [dr.fma(weight, light[c], sums[3 * i + c]) for i, weight in enumerate(weights) for c in range(3)]
-        return pair + 1, sums
-
-    sums = [dr.zeros(ad.Float, batch.capacity) for _ in range(6 * len(kinds))]
-    return list(dr.while_loop((ad.UInt32(0), sums), has_more, add, mode="symbolic", label="bounce")[1])
-
-
-def irradiance(scatterers: Scatterers, batch: PaddedBatch) -> Weights:
-    """Light at the side to which a Gaussian's normal points, then at the other, w cos / pi of each ray; 1 where the
-    light of all around is 1."""
-    normals = _normals(scatterers, batch)
-
-    def at_sides(towards: Array3f, share: Float) -> list[Float]:
+    def weights(towards: Array3f) -> list[Float]:
         here = dr.dot(normals, towards)
         return [share * dr.maximum(here, 0), share * dr.maximum(-here, 0)]
 
-    return at_sides
+    begin, *_, end = _bounds(surroundings, rays)
+    return _in_columns(_gathered(surroundings, emitted, emitters, (begin, end), weights, 2), rays, batch)
 
 
-def mirroring(scatterers: Scatterers, direction: Array3f, batch: PaddedBatch) -> Weights:
-    """Light that a Gaussian mirrors towards the viewer, on the scale of `irradiance`: per specular reflectance at
-    normal incidence, then per what it is at grazing incidence. direction: Array3f [3, M], unit, from the camera
+def received_on_seen(
+    scatterers: Scatterers,
+    surroundings: Surroundings,
+    emitted: list[Float],
+    emitters: int,
+    batch: PaddedBatch,
+    directions: Callable[[PaddedBatch], Array3f],
+    diffuse: bool,
+    mirrors: bool,
+) -> list[Float]:
+    """With `diffuse` what `received_on_sides` says of the side that is seen, three Floats [M]; with `mirrors` six of
+    `_mirroring`. directions: Array3f [3, M], unit, from the camera to a batch's Gaussians"""
+    rays = _in_order(surroundings, batch)
+    direction, normals = directions(rays), _normals(scatterers, rays)
+    away, normals = points_away(normals, direction), seen_side_normals(normals, direction)
+    share = ad.Float(4 / ray_count(emitters))
+    mirrored = _mirroring(normals, direction, share)
+
+    def weights(towards: Array3f) -> list[Float]:
+        scattered = [share * dr.maximum(dr.dot(normals, towards), 0)] if diffuse else []
+        return scattered + (mirrored(towards) if mirrors else [])
+
+    begin, behind, past, end = _bounds(surroundings, rays)
+    bounds = dr.select(away, behind, begin), dr.select(away, end, past)
+    count = diffuse + 2 * mirrors
+    return _in_columns(_gathered(surroundings, emitted, emitters, bounds, weights, count), rays, batch)
+
+
+def _in_order(surroundings: Surroundings, batch: PaddedBatch) -> PaddedBatch:
+    """As long, in the order in which rays are gathered: a batch of chosen Gaussians is in it."""
+    return batch if batch.chosen else replace(batch, chosen=Chosen(batch.count, surroundings.order, None))
+
+
+def _in_columns(values: list[Float], rays: PaddedBatch, batch: PaddedBatch) -> list[Float]:
+    """Of the columns of `_in_order` to the batch's."""
+    if rays is batch:
+        return values
+    columns = [dr.zeros(ad.Float, batch.capacity) for _ in values]
+    for column, value in zip(columns, values, strict=True):
+        dr.scatter(column, value, rays.numbers(), rays.is_real(), dr.ReduceMode.Permute)
+    dr.eval(columns)
+    return columns
+
+
+def _bounds(surroundings: Surroundings, batch: PaddedBatch) -> list[UInt32]:
+    """The four of `Surroundings.bounds`, [M] each."""
+    return [dr.gather(ad.UInt32, surroundings.bounds, i * batch.count + batch.numbers()) for i in range(4)]
+
+
+def _gathered(
+    surroundings: Surroundings,
+    emitted: list[Float],
+    emitters: int,
+    bounds: tuple[UInt32, UInt32],
+    weights: Weights,
+    count: int,
+) -> list[Float]:
+    """Light along the rays from one of `Surroundings.met` to before another, three Floats [M], RGB, for each of so many
+    weights."""
+    (first, end), rays, turn = bounds, ray_count(emitters), TURN[select()]
+
+    def has_more(k: UInt32, end: UInt32, _sums: list[Float]) -> Bool:
+        return k < end
+
+    def add(k: UInt32, end: UInt32, sums: list[Float]) -> tuple[UInt32, UInt32, list[Float]]:
+        listed = [k + u < end if u else ad.Bool(True) for u in range(turn)]
+        met = [dr.gather(ad.UInt32, surroundings.met, k + u, listed[u]) for u in range(turn)]
+        light = [load(emitted, met[u] & 0xFFFF, 2 * emitters, listed[u])[:3] for u in range(turn)]
+        towards = [ad.Array3f(load(surroundings.directions, ray >> 16, rays)[:3]) for ray in met]
+        for u in range(turn):
+            terms = [(weight, light[u][c]) for weight in weights(towards[u]) for c in range(3)]
+            sums = [dr.fma(*term, total) for term, total in zip(terms, sums, strict=True)]
+        return k + turn, end, sums
+
+    sums = [ad.Float(0) for _ in range(3 * count)]
+    return list(dr.while_loop((first, end, sums), has_more, add, mode="symbolic", label="bounce")[2])
+
+
+def _mirroring(normals: Array3f, direction: Array3f, share: Float) -> Weights:
+    """Light that a Gaussian mirrors towards the viewer, on the scale of `received_on_sides`: per specular reflectance
+    at normal incidence, then per what it is at grazing incidence. normals, direction: Array3f [3, M], unit, of the side
+    that is seen and from the camera;  share: the angle w that a ray stands for, over pi
 
     D n.l w / (4 (l.h)^2), the first times 1 - f, the other times f = (1 - l.h)^5: facets of GGX (Walter et al. 2007)
-    with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's reflectance (1994); w the angle that a ray
-    stands for, h halfway between it and the viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the ray's own spread.
+    with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's reflectance (1994); h halfway between the ray
+    and the viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the ray's own spread.
     """
-    normals = seen_side_normals(_normals(scatterers, batch), direction)
     view = -dr.dot(normals, direction)
 
-    def mirrored(towards: Array3f, share: Float) -> list[Float]:
+    def mirrored(towards: Array3f) -> list[Float]:
         here = dr.dot(normals, towards)
         both = dr.maximum(1 - dr.dot(towards, direction), 1e-6)  # 1 + l.v = 2 (l.h)^2
         alpha2 = 0.25 * share + ROUGHNESS**2
@@ -118,7 +175,7 @@ def grazing_reflectance_slope(specular: Float) -> Float:
 def emission(
     scatterers: Scatterers, surroundings: Surroundings, emitters: int, light: list[Float], gaussians: UInt32
 ) -> list[Float]:
-    """What `gathered` reads of `emitters`: each scatters light from its side that faces the Sun alone. light: that
+    """What is gathered of `emitters`: each scatters light from its side that faces the Sun alone. light: that
     they scatter, RGB, Floats [emitters];  gaussians: N"""
     is_back_lit = dr.dot(_normals_of(scatterers, surroundings.emitters, gaussians), scatterers.sun) < 0
     side = 2 * dr.arange(ad.UInt32, emitters) + dr.select(is_back_lit, ad.UInt32(1), 0)

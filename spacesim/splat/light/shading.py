@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Array3f, Float, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.learning.reflectance import surface_cosines
@@ -19,12 +19,11 @@ from spacesim.splat.light.bounce import (
     add_irradiance_slopes,
     albedo_radiance,
     emission,
-    gathered,
     grazing_reflectance,
     grazing_reflectance_slope,
-    irradiance,
     lit_normals,
-    mirroring,
+    received_on_seen,
+    received_on_sides,
 )
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import (
@@ -83,8 +82,8 @@ def shade(
     dr.eval(outputs, colors, occlusion, visibility, faces)
     shares = _emitters_visibility(config, refine_weights, inputs, batch, visibility)
     emitted = _emitted(config, field_weights, inputs, shares, batch, field_tape.input_layer)
-    light = _received(config, inputs, emitted, batch, sides=True, mirrors=config.mirrors)
-    scattered = _scattered(config, inputs, light[:6], light[6:], batch)
+    light = _received(config, inputs, emitted, batch, diffuse=True, mirrors=config.mirrors)
+    scattered = _scattered(config, inputs, light[:3], light[3:], batch)
     if scattered:
         outputs = _add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
@@ -117,7 +116,10 @@ def shade_picture(
     visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
     shown = _dimmed(inputs.sun, colors, visibility, faces)
     bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
-    mirrored = _received(config, inputs, sunlight.emitted, batch, sides=False, mirrors=True)
+    if bounced:
+        over = is_back_side_seen(field, field_inputs, batch)
+        bounced = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
+    mirrored = _received(config, inputs, sunlight.emitted, batch, diffuse=False, mirrors=True)
     scattered = _scattered(config, inputs, bounced, mirrored, batch)
     if scattered:
         shown = _add_scattered(config, inputs, shown, scattered, batch)
@@ -142,7 +144,10 @@ def scatter_sunlight(
     """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
     field_weights, _ = split_weights(config, weights)
     emitted = _emitted(config, field_weights, inputs, _of_emitters(inputs, visibility), batch)
-    bounced = _received(config, inputs, emitted, batch, sides=True, mirrors=False)
+    bounced: list[Float] = []
+    if emitted and inputs.surroundings:
+        scatterers = _scatterers(config, inputs)
+        bounced = received_on_sides(scatterers, inputs.surroundings, emitted, config.bounce, batch)
     dr.eval(bounced)
     return batch.unpad(bounced, inputs.means.x), emitted if config.mirrors else []
 
@@ -297,19 +302,19 @@ def _emitters_visibility(
 
 
 def _received(
-    config: LightConfig, inputs: ShadingInputs, emitted: list[Float], batch: PaddedBatch, sides: bool, mirrors: bool
+    config: LightConfig, inputs: ShadingInputs, emitted: list[Float], batch: PaddedBatch, diffuse: bool, mirrors: bool
 ) -> list[Float]:
-    """Six Floats [M], RGB, of `irradiance` with `sides`, then six of `mirroring` with `mirrors`; nothing where nothing
-    is emitted."""
+    """Of `received_on_seen`; nothing where nothing is emitted."""
     if not emitted or inputs.surroundings is None:
         return []
-    scatterers = _scatterers(config, inputs)
-    kinds = [irradiance(scatterers, batch)] if sides else []
-    if mirrors:
-        assert inputs.camera is not None
-        direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
-        kinds.append(mirroring(scatterers, direction, batch))
-    return gathered(inputs.surroundings, emitted, config.bounce, batch, *kinds)
+    camera, scatterers = inputs.camera, _scatterers(config, inputs)
+    assert camera is not None
+
+    def directions(rays: PaddedBatch) -> Array3f:
+        return camera.directions_to(rays.repeat_last(inputs.means))
+
+    around = inputs.surroundings
+    return received_on_seen(scatterers, around, emitted, config.bounce, batch, directions, diffuse, mirrors)
 
 
 def _painted(
@@ -353,15 +358,10 @@ def _scattered(
     config: LightConfig, inputs: ShadingInputs, bounced: list[Float], mirrored: list[Float], batch: PaddedBatch
 ) -> list[Float]:
     """Three Floats [M]: light of the bounce and the Earth that arrives at the side that is seen, or nothing where there
-    is neither; where surfaces mirror, the six of `mirroring`, too. bounced, mirrored: six Floats [M] each, or nothing,
-    before the Earth takes of them"""
-    light: list[Float] = []
-    field_inputs = inputs.of_field()
-    bounced, mirrored = inputs.sun.left(bounced), inputs.sun.left(mirrored)
-    if bounced:
-        over = is_back_side_seen(config.field, field_inputs, batch)
-        light = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
-    for earth in earthlight(config.field, field_inputs, batch):
+    is neither; where surfaces mirror, six more. bounced, mirrored: of `received_on_seen`, three and six Floats [M], or
+    nothing, before the Earth takes of them"""
+    light, mirrored = inputs.sun.left(bounced), inputs.sun.left(mirrored)
+    for earth in earthlight(config.field, inputs.of_field(), batch):
         light = [channel + config.sunlit_white * earth for channel in light or [ad.Float(0)] * 3]
     return light + mirrored
 

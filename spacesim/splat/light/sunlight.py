@@ -35,6 +35,6 @@ class Sunlight:
     """What of a Sun's light no camera changes."""
 
     visibility: Float | None  #: Float [N], what dims colours (4.17), or None for 1
-    bounced: list[Float]  #: of `bounce.irradiance`, Floats [N], or nothing
+    bounced: list[Float]  #: of `bounce.received_on_sides`, Floats [N], or nothing
     #: of `bounce.emission`, where surfaces mirror it, or nothing
     emitted: list[Float] = field(default_factory=list)

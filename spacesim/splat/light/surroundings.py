@@ -5,7 +5,7 @@ once. To rays, Gaussians are discs across their two longer axes. They are traced
 training now and then (`are_due`): in between, Gaussians that come see what those see that they were made of.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import cast
 
@@ -17,12 +17,13 @@ from scipy.spatial import cKDTree
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, UInt32
 from spacesim.backend.memory import check_free_memory
-from spacesim.backend.packet import packets, store
+from spacesim.backend.packet import load, packets, store
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.geometry import Array, fibonacci_sphere
 from spacesim.learning.reflectance import unit_normals
 from spacesim.splat.light.disc_grid import MISSED, DiscGrid
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
+from spacesim.splat.raster.lists.tiles import round_capacity
 
 #: steps of training after which rays are traced anew: the first, then each so many, and from `EARLY` on each so many
 FIRST, OFTEN, EARLY, RARELY = 50, 100, 1000, 500
@@ -41,7 +42,8 @@ NORMALS_APART = 0.05  #: of the model's radius: how much a normal counts beside 
 CELLS = 1 << 10  #: on a side of the model, along whose curve emitters are chosen
 MIDDLE_STEP = 0.25  #: of the model's radius: the curve's cube moves by so much at least
 SOME = 10_000  #: Gaussians that say where the middle of a model is
-SKY = 0xFFFF  #: of `Surroundings.seen`: nothing
+SKY = 0xFFFF  #: in place of an emitter's side: nothing
+LEVEL = 0.1  #: cosine to the normal up to which a ray is along the surface: normals turn until rays are traced again
 SOURCE = "surfaces.source"  #: in checkpoints
 GONE = 0xFFFFFFFF  #: in place of a Gaussian's number
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
@@ -92,19 +94,24 @@ class Surfaces:
 
 @dataclass
 class Surroundings:
-    """What N Gaussians see along R rays each, whose directions are the same for all."""
+    """What N Gaussians see along R rays each, whose directions are the same for all: of the rays that meet something,
+    one Gaussian's after another's."""
 
     emitters: UInt32  #: the Gaussians that stand for all where light comes from, [`LightConfig.bounce`]
-    #: of rays 2 k and 2 k + 1 of Gaussian i in place k N + i, 16 bits each, the lower ones first: twice the number of
-    #: the emitter, and 1 more where the ray meets the side to which its normal does not point; SKY for nothing
-    seen: UInt32
-    directions: list[Float]  #: of two rays a record, see `records.load`
+    #: of each such ray in the lower 16 bits twice the number of the emitter, and 1 more where the ray meets the side to
+    #: which its normal does not point; above them the ray's number
+    met: UInt32
+    #: where a Gaussian's rays stand in `met`, [4 N], row by row: the first; the first on the side to which its normal
+    #: does not point; one past the last on the other; one past the last. Those along the surface (`LEVEL`) are on both
+    bounds: UInt32
+    #: the Gaussians by how many they are on the side that has fewer, the one seen as a rule: threads that run together
+    #: take as long, and the longest begin first. Then the numbers from N up to `round_capacity(N)`
+    order: UInt32
+    directions: list[Float]  #: a ray's is a record, see `records.load`
 
     def of(self, source: UInt32, count: int) -> "Surroundings":
         """What Gaussians see each of which was `source` [M] of the `count` that saw this. One that emits and has gone
-        does so from the place of the emitter before it, which is mostly near. Raises MemoryError as `look_around`."""
-        pairs = dr.width(self.seen) // count
-        _check_memory(pairs, dr.width(source))
+        does so from the place of the emitter before it, which is mostly near."""
         sources = source.numpy()
         first = np.full(count, GONE, np.uint32)
         first[sources[::-1]] = np.arange(len(sources), dtype=np.uint32)[::-1]  # the first of several is written last
@@ -115,11 +122,8 @@ class Surroundings:
         else:
             numbers = np.where(is_gone, np.argmin(is_gone), np.arange(len(emitters)))
             emitters = emitters[np.maximum.accumulate(numbers)]
-        before, now = (dr.opaque(ad.UInt32, n) for n in (count, len(sources)))
-        slot = dr.arange(ad.UInt32, pairs * len(sources))
-        seen = dr.gather(ad.UInt32, self.seen, slot // now * before + dr.gather(ad.UInt32, source, slot % now))
-        dr.eval(seen)
-        return Surroundings(upload(emitters, ad.UInt32), seen, self.directions)
+        bounds = self.bounds.numpy().reshape(4, count)[:, sources]
+        return Surroundings(upload(emitters, ad.UInt32), self.met, *_in_order(bounds), self.directions)
 
 
 class HeldSurroundings:
@@ -190,25 +194,87 @@ def look_around(surfaces: Surfaces, emitters: int, radius: float) -> Surrounding
     """Trace the rays. emitters: how many;  radius: of the model, metres. Raises MemoryError where what they meet does
     not fit into memory."""
     directions, count = fibonacci_sphere(ray_count(emitters)), len(surfaces.means)
-    pairs = len(directions) // 2
-    _check_memory(pairs, count)
-    rows = [upload(row) for row in directions.reshape(pairs, 6).T]
-    packed = [store(values, dr.arange(ad.UInt32, pairs), pairs) for values in packets(rows)]
+    _check_memory(len(directions) // 2 * count, count)
+    packed = _packed(directions)
     shapes = _Shapes.of(surfaces, radius)
     order = _order(shapes)
     numbers, emitter_of = _choose(shapes, order, emitters)
-    seen = dr.opaque(ad.UInt32, SKY | SKY << 16, pairs * count)
+    seen = dr.opaque(ad.UInt32, SKY | SKY << 16, len(directions) // 2 * count)
     discs = _Discs.of(shapes)
     if discs is not None:
         _trace(seen, shapes, discs, directions, order, emitter_of)
-    result = Surroundings(upload(numbers, ad.UInt32), seen, packed)
+    result = Surroundings(upload(numbers, ad.UInt32), *_met(seen, shapes.normals, packed, len(directions)), packed)
     dr.eval(result)
     return result
 
 
-def _check_memory(pairs: int, count: int) -> None:
-    """Raise MemoryError where `Surroundings.seen` of so many pairs of rays does not fit into memory."""
-    check_free_memory(4 * pairs * count, f"light that bounces onto {count} Gaussians")
+def _packed(directions: Array) -> list[Float]:
+    """`Surroundings.directions` of [R, 3]."""
+    ray, rows = dr.arange(ad.UInt32, len(directions)), [upload(row) for row in directions.T]
+    return [store(values, ray, len(directions)) for values in packets(rows)]
+
+
+def _check_memory(numbers: int, count: int) -> None:
+    """Raise MemoryError where so many numbers do not fit into memory. count: Gaussians"""
+    work = f"light that bounces onto {count} Gaussians"
+    if numbers >= 2**32:
+        raise MemoryError(f"{work}: {numbers:.3g} rays, at most {2**32:.3g} have numbers")
+    check_free_memory(4 * numbers, work)
+
+
+def _met(seen: UInt32, normals: Array3f, directions: list[Float], rays: int) -> tuple[UInt32, UInt32, UInt32]:
+    """(`Surroundings.met`, bounds, order) of what N Gaussians see. seen: of rays 2 k and 2 k + 1 of Gaussian i in place
+    k N + i, 16 bits each, the lower ones first: as in `Surroundings.met`, or SKY for nothing"""
+    gaussian, count = dr.arange(ad.UInt32, dr.width(normals)), dr.opaque(ad.UInt32, dr.width(normals))
+
+    def has_more(pair: UInt32, _state: object) -> Bool:
+        return pair < rays // 2
+
+    def met(pair: UInt32) -> Iterator[tuple[UInt32, list[Bool]]]:
+        """Of both rays: what stands in `Surroundings.met`, whether it is before, along, behind the surface."""
+        word = dr.gather(ad.UInt32, seen, pair * count + gaussian)
+        for half, side in enumerate((word & 0xFFFF, word >> 16)):
+            ray = 2 * pair + half
+            cosine = dr.dot(normals, ad.Array3f(load(directions, ray, rays)[:3]))
+            before, behind = cosine > LEVEL, cosine < -LEVEL
+            yield ray << 16 | side, [(side != SKY) & part for part in (before, ~(before | behind), behind)]
+
+    def count_met(pair: UInt32, numbers: list[UInt32]) -> tuple[UInt32, list[UInt32]]:
+        for _, parts in met(pair):
+            numbers = [number + dr.select(part, ad.UInt32(1), 0) for number, part in zip(numbers, parts, strict=True)]
+        return pair + 1, numbers
+
+    nothing = [dr.zeros(ad.UInt32, dr.width(normals)) for _ in range(3)]
+    _, numbers = dr.while_loop((ad.UInt32(0), nothing), has_more, count_met, mode="symbolic", label="count rays")
+    dr.eval(numbers)
+    before, along, behind = (number.numpy().astype(np.int64) for number in numbers)
+    end = np.cumsum(before + along + behind)
+    total = int(end[-1]) if len(end) else 0
+    _check_memory(total, dr.width(normals))
+    target = dr.zeros(ad.UInt32, round_capacity(total))
+    dr.eval(target)
+    bounds = np.stack([end - behind - along - before, end - behind - along, end - behind, end]).astype(np.uint32)
+
+    def write_met(pair: UInt32, places: list[UInt32]) -> tuple[UInt32, list[UInt32]]:
+        for value, parts in met(pair):
+            for place, part in zip(places, parts, strict=True):
+                dr.scatter(target, value, place, part)
+            places = [place + dr.select(part, ad.UInt32(1), 0) for place, part in zip(places, parts, strict=True)]
+        return pair + 1, places
+
+    first = [upload(row, ad.UInt32) for row in bounds[:3]]
+    dr.while_loop((ad.UInt32(0), first), has_more, write_met, mode="symbolic", label="list rays")
+    dr.eval(target)
+    return target, *_in_order(bounds)
+
+
+def _in_order(bounds: Indices) -> tuple[UInt32, UInt32]:
+    """(`Surroundings.bounds`, order) of [4, N]."""
+    first, behind, past, end = bounds
+    fewer = np.minimum(past - first, end - behind).astype(np.int64)
+    order = np.argsort(-fewer, kind="stable")
+    beyond = np.arange(len(order), round_capacity(len(order)))
+    return upload(bounds.ravel(), ad.UInt32), upload(np.concatenate([order, beyond]).astype(np.uint32), ad.UInt32)
 
 
 @dataclass
@@ -282,8 +348,8 @@ class _Discs:
 def _trace(
     seen: UInt32, shapes: _Shapes, discs: _Discs, directions: Array, order: Indices, emitter_of: Indices
 ) -> None:
-    """Fill in `Surroundings.seen`. order: of `_order`: rays that follow on each other take as long;  emitter_of: as
-    `_choose` says"""
+    """Fill in what is `seen`, see `_met`. order: of `_order`: rays that follow on each other take as long;
+    emitter_of: as `_choose` says"""
     grid, count = DiscGrid.of(discs.centers, discs.axes), len(order)
     # of areas that are no number, too: nothing
     distance: Float = dr.select(shapes.areas > 0, AWAY * dr.sqrt(shapes.areas), 0)

@@ -166,7 +166,8 @@ class ViewPass:
         if self._hidden is not None and light is not None:
             if drawn is not None:
                 lists, drawn = _lists_of(drawn, extent, pairs), None
-            shown = shown_splats(splats, lists, (camera.width, camera.height), self._hidden)
+            around, size = light.surroundings(gaussians), (camera.width, camera.height)
+            shown = shown_splats(splats, lists, size, self._hidden, around.order if around else None)
             room = self.pairs.of_view("shown", view.index).room_for(extent, shown.count)
             batch = PaddedBatch.of_chosen(shown, room, gaussians.count) if room else None
         of_sun = self.pairs.of_view("sun", view.index)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
-from splats import light_of, srgb_of
+from splats import light_of, met_along, srgb_of
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
@@ -198,8 +198,7 @@ def bounced(light: LightModel, arrays: dict, visibility: np.ndarray, paint) -> n
     if not config.bounce:
         return np.zeros((count, 9 if config.gloss else 3))
     surroundings, rays = light.surroundings(Gaussians.from_numpy(arrays)), ray_count(config.bounce)
-    words = np.array(surroundings.seen).reshape(-1, count)
-    met = np.stack([words & 0xFFFF, words >> 16], axis=1).reshape(rays, count).astype(int)
+    met = met_along(surroundings, count, rays)
     scattered = np.zeros((0x10000, 3))  # of the sides of emitters, and of the sky
     for number, k in enumerate(np.array(surroundings.emitters)):
         back = normals[k] @ SUN < 0

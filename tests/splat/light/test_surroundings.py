@@ -5,11 +5,13 @@ from dataclasses import fields, replace
 import drjit as dr
 import numpy as np
 import pytest
+from splats import met_along
 
 from spacesim.backend import ad, memory
 from spacesim.backend.upload import upload
 from spacesim.data.geometry import fibonacci_sphere, rotation_from_quaternion
 from spacesim.splat.light import model as light_module
+from spacesim.splat.light import surroundings as surroundings_module
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import FieldConfig, SurfaceConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
@@ -18,17 +20,18 @@ from spacesim.splat.light.surroundings import (
     EDGE,
     FARTHEST,
     LEAST_RAYS,
+    LEVEL,
     MOST_RAYS,
     OPAQUE,
     SKY,
     HeldSurroundings,
     Surfaces,
-    Surroundings,
     are_due,
     look_around,
     ray_count,
 )
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.train.config import preset, with_options
 from spacesim.splat.train.trainer import Trainer
 
@@ -57,12 +60,6 @@ def lit_model(of: Surfaces, emitters: int) -> tuple[LightModel, Gaussians]:
     return LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, 5.0, RADIUS), 0), splats
 
 
-def seen_along(surroundings: Surroundings, count: int) -> np.ndarray:
-    """[R, N] of `Surroundings.seen`, ray by ray."""
-    words = np.array(surroundings.seen).reshape(-1, count)
-    return np.stack([words & 0xFFFF, words >> 16], axis=1).reshape(-1, count).astype(int)
-
-
 def first_met(of: Surfaces, towards: np.ndarray) -> np.ndarray:
     """[N] the first disc that a ray from each Gaussian meets, -1 for none: one pair after another."""
     opacity, scales = 1 / (1 + np.exp(-of.logit_opacities.astype(float))), np.exp(of.log_scales.astype(float))
@@ -86,7 +83,7 @@ def first_met(of: Surfaces, towards: np.ndarray) -> np.ndarray:
 def test_rays_meet_what_they_meet_in_float64():
     of, count = surfaces(150), 150
     surroundings = look_around(of, 200, RADIUS)
-    found, directions = seen_along(surroundings, count), fibonacci_sphere(ray_count(200))
+    found, directions = met_along(surroundings, count, ray_count(200)), fibonacci_sphere(ray_count(200))
     emitters = np.append(np.array(surroundings.emitters), -np.ones(0x8000)).astype(int)
     normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
     same, sides, hits = [], [], 0
@@ -102,8 +99,28 @@ def test_rays_meet_what_they_meet_in_float64():
     assert np.mean(sides) > 0.999
 
 
+def test_rays_of_a_side_follow_on_each_other():
+    """Those along the surface are on both; first come the Gaussians with most on the side that has fewer."""
+    of, count = surfaces(150), 150
+    around, directions = look_around(of, 200, RADIUS), fibonacci_sphere(LEAST_RAYS)
+    normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
+    met, bounds = np.array(around.met), np.array(around.bounds).reshape(4, count)
+    for normal, (first, behind, past, end) in zip(normals, bounds.T, strict=True):
+        cosines = directions[met[first:end] >> 16] @ normal
+        along, after = behind - first, past - first
+        assert (cosines[:along] > LEVEL - 1e-6).all()
+        assert (np.abs(cosines[along:after]) < LEVEL + 1e-6).all()
+        assert (cosines[after:] < -LEVEL + 1e-6).all()
+    assert (bounds[0, 1:] == bounds[3, :-1]).all()
+    fewer = np.minimum(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    order = np.array(around.order)
+    assert 0 <= fewer.min() < fewer.max()
+    assert (np.diff(fewer[order[:count]].astype(int)) <= 0).all()
+    np.testing.assert_array_equal(np.sort(order), np.arange(round_capacity(count)))
+
+
 def test_what_is_no_number_stops_no_ray_and_changes_no_other():
-    of, count, broken = surfaces(150), 150, slice(3, 9)
+    of, count = surfaces(150), 150
     arrays = {field.name: getattr(of, field.name).copy() for field in fields(Surfaces)}
     hidden = replace(
         of, logit_opacities=np.where((np.arange(count) >= 3) & (np.arange(count) < 9), -9, of.logit_opacities)
@@ -111,7 +128,7 @@ def test_what_is_no_number_stops_no_ray_and_changes_no_other():
     arrays["means"][3, 0], arrays["means"][4, 2], arrays["log_scales"][5, 1] = np.nan, np.inf, np.nan
     arrays["log_scales"][6, 0], arrays["quaternions"][7, 0], arrays["logit_opacities"][8] = 1e30, np.nan, np.nan
     sound, odd = (look_around(one, 200, RADIUS) for one in (hidden, Surfaces(**arrays)))
-    expected, found = (np.delete(seen_along(one, count), np.arange(count)[broken], axis=1) for one in (sound, odd))
+    expected, found = (np.delete(met_along(one, count, LEAST_RAYS), np.arange(3, 9), axis=1) for one in (sound, odd))
     assert (expected != SKY).mean() > 0.2
     np.testing.assert_array_equal(found, expected)
 
@@ -121,10 +138,13 @@ def test_too_many_rays_for_the_memory_are_refused(monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda needed=0: 2 * LEAST_RAYS * 5 - 1)
     with pytest.raises(MemoryError, match="light that bounces onto 5 Gaussians needs about"):
         look_around(surfaces(5), 10, RADIUS)
-    monkeypatch.setattr(memory, "free_memory", lambda needed=0: 2 * LEAST_RAYS * 5)
-    seen = look_around(surfaces(5), 10, RADIUS)
-    with pytest.raises(MemoryError, match="light that bounces onto 6 Gaussians needs about"):
-        seen.of(upload(np.array([0, 1, 2, 3, 4, 4]), ad.UInt32), 5)
+    free = [2 * LEAST_RAYS * 5, 3]  # enough for the rays, then not for what they meet
+    monkeypatch.setattr(memory, "free_memory", lambda needed=0: free.pop(0))
+    with pytest.raises(MemoryError, match="light that bounces onto 5 Gaussians needs about"):
+        look_around(surfaces(5), 10, RADIUS)
+    assert not free
+    with pytest.raises(MemoryError, match=r"4.29e\+09 have numbers"):
+        surroundings_module._check_memory(2**32, 5)
 
 
 def test_few_emitters_stand_for_what_is_near():
@@ -135,7 +155,7 @@ def test_few_emitters_stand_for_what_is_near():
     numbers = np.array(some.emitters)
     assert numbers.shape == (few,)
     assert len(np.unique(numbers)) > 0.9 * few
-    met, stands = (seen_along(one, 900) for one in (every, some))
+    met, stands = (met_along(one, 900, ray_count(few)) for one in (every, some))
     assert ((met == SKY) == (stands == SKY)).all()
     hit = met != SKY
     met, stands = np.array(every.emitters)[met[hit] // 2], numbers[stands[hit] // 2]
@@ -153,14 +173,14 @@ def test_rays_are_even_in_number(emitters):
 
 def test_the_same_gaussians_see_the_same_to_the_bit():
     one, other = (look_around(surfaces(500), 100, RADIUS) for _ in range(2))
-    np.testing.assert_array_equal(np.array(one.seen), np.array(other.seen))
+    np.testing.assert_array_equal(np.array(one.met), np.array(other.met))
     np.testing.assert_array_equal(np.array(one.emitters), np.array(other.emitters))
 
 
 def test_where_the_world_begins_makes_no_difference():
     of = surfaces(300)
     moved = replace(of, means=of.means + np.float32([64, -512, 32]))
-    near, far = (seen_along(look_around(one, 400, RADIUS), 300) for one in (of, moved))
+    near, far = (met_along(look_around(one, 400, RADIUS), 300, ray_count(400)) for one in (of, moved))
     assert (near != SKY).mean() > 0.2
     assert (near == far).mean() > 0.99, "but for rounding"
 
@@ -215,7 +235,8 @@ def test_those_that_come_see_what_they_were_made_of_saw():
         held.follow(upload(source, ad.UInt32))
     parents = first[second]
     now = held.surroundings(40, RADIUS, len(parents))
-    np.testing.assert_array_equal(seen_along(now, len(parents)), seen_along(whole, count)[:, parents])
+    rays = ray_count(40)
+    np.testing.assert_array_equal(met_along(now, len(parents), rays), met_along(whole, count, rays)[:, parents])
     emitters = np.array(now.emitters)
     expected = [10 if e == 11 else 2 if e == 3 else e for e in np.array(whole.emitters)]
     np.testing.assert_array_equal(parents[emitters], expected)
@@ -248,7 +269,8 @@ def test_an_opacity_reset_hides_no_surroundings(small_lit_dataset, reset_every, 
     assert opacities.max() < OPAQUE, "reset"
     around = trainer.light.surroundings(trainer.gaussians)
     assert around is not None
-    assert (seen_along(around, trainer.gaussians.count) != SKY).mean() > 0.05
+    rays = ray_count(trainer.light.config.bounce)
+    assert (met_along(around, trainer.gaussians.count, rays) != SKY).mean() > 0.05
 
 
 def test_rays_are_traced_often_at_first():
