@@ -36,15 +36,19 @@ STEPS = {"cuda": "100000x512", "llvm": "10000x128"}
 THESIS = {31622: 108, 101958: 77, 165495: 70}  #: frames per second (section 4.3.6, shadow mapping)
 
 
+def lit_arrays(count: int, features: int) -> dict[str, np.ndarray]:
+    """The sphere's splats with so many features each, and no harmonics."""
+    learned = np.random.default_rng(0).normal(size=(count, features)).astype(np.float32)
+    return {**common.sphere_arrays(count), "sh": np.zeros((count, 0, 3)), "features": learned}
+
+
 class Frame:
     """A relightable sphere and the parts of its picture. Each call has another Sun."""
 
     def __init__(self, count: int, pixels: int, method: str, size: str) -> None:
         config = preset(size, method).light
         assert config is not None
-        arrays = {**common.sphere_arrays(count), "sh": np.zeros((count, 0, 3))}
-        arrays["features"] = np.random.default_rng(0).normal(size=(count, config.features)).astype(np.float32)
-        self.gaussians = Gaussians.from_numpy(arrays)
+        self.gaussians = Gaussians.from_numpy(lit_arrays(count, config.features))
         self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), 0)
         self.camera = Pinhole.of(common.camera_from(DIRECTION, pixels))
         dr.eval(self.gaussians.rows(), self.camera.values)
@@ -112,7 +116,9 @@ def measure_step(count: int, pixels: int, method: str, options: Any) -> common.R
         data = synthetic.write_dataset(Path(folder) / "data", count, pixels)
         lit = [replace(frame, sun=Sun(SUNS[i])) for i, frame in enumerate(data.train)]
         light = preset(options.preset, method).light
-        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, light=light)
+        assert light is not None
+        arrays = lit_arrays(count, light.features)
+        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, arrays, light=light)
         clock = common.interleaved({"step": lambda: dr.eval(trainer.step())}, options.repeats)["step"]
         sums = common.kernels(lambda: dr.eval(trainer.step()))
     return {"Gaussians": count, "pixels": pixels, "method": method, "step (quartiles)": str(clock)} | {

@@ -31,7 +31,7 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "a7f87dff8698aab9",
+    "demo": "fe6559052c6d7fbd",
     "fast": "80f63ed58894ff42",
     "fine": "cb918a10d10dbdea",
     "thesis": "edb72c435b0398fb",
@@ -54,10 +54,11 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
         return with_settings(config, {"light.shadow.method.beta_min": 0.05})
     features = 16 if config.preset == "demo" else 32
     settings = {"light.field.features": features, "rates.features_final": config.rates.features, "surfels": False}
+    settings["hidden_weight"] = 0.0
     if config.method in ("shadow-map", "shadow-splat"):
         fine = {"supersample": 2, "light.bounce": 1024, "iterations": 20_000, "refinement.prune_opacity": 0.005}
         settings |= {"views_per_step": 1, "light.gloss": False, "refinement.max_gaussians": 250_000}
-        settings |= {"rates.surface_start": 1.0, "hidden_weight": 0.0}
+        settings["rates.surface_start"] = 1.0
         settings |= fine if config.preset == "fine" else {"supersample": 1, "light.bounce": 256}
         if config.preset == "fast":
             settings["refinement.split_screen_size"] = 0.03
