@@ -48,7 +48,7 @@ def received_on_sides(
     """Light that each Gaussian receives at the side to which its normal points, then at the other: RGB, Floats [M]
     each, w cos / pi of each ray, which is 1 where the light of all around is 1. emitted: of `emission`, by so many
     `emitters`"""
-    rays = _in_order(surroundings, batch)
+    rays = _sorted_batch(surroundings, batch)
     normals, share = _normals(scatterers, rays), ad.Float(4 / ray_count(emitters))
 
     def weights(towards: Array3f) -> list[Float]:
@@ -71,7 +71,7 @@ def received_on_seen(
 ) -> list[Float]:
     """With `diffuse` what `received_on_sides` says of the side that is seen, three Floats [M]; with `mirrors` six of
     `_mirroring`. directions: Array3f [3, M], unit, from the camera to a batch's Gaussians"""
-    rays = _in_order(surroundings, batch)
+    rays = _sorted_batch(surroundings, batch)
     direction, normals = directions(rays), _normals(scatterers, rays)
     away, normals = points_away(normals, direction), seen_side_normals(normals, direction)
     share = ad.Float(4 / ray_count(emitters))
@@ -87,13 +87,13 @@ def received_on_seen(
     return _in_columns(_gathered(surroundings, emitted, emitters, bounds, weights, count), rays, batch)
 
 
-def _in_order(surroundings: Surroundings, batch: PaddedBatch) -> PaddedBatch:
-    """As long, in the order in which rays are gathered: a batch of chosen Gaussians is in it."""
+def _sorted_batch(surroundings: Surroundings, batch: PaddedBatch) -> PaddedBatch:
+    """The same Gaussians in `Surroundings.order`, in which their rays are gathered sooner; chosen ones as they come."""
     return batch if batch.chosen else replace(batch, chosen=Chosen(batch.count, surroundings.order, None))
 
 
 def _in_columns(values: list[Float], rays: PaddedBatch, batch: PaddedBatch) -> list[Float]:
-    """Of the columns of `_in_order` to the batch's."""
+    """Values [M] of the Gaussians of `rays`, a `_sorted_batch`, as the batch has these."""
     if rays is batch:
         return values
     columns = [dr.zeros(ad.Float, batch.capacity) for _ in values]

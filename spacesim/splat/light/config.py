@@ -9,7 +9,7 @@ from spacesim.splat.light.field import Decoding, FieldConfig
 from spacesim.splat.light.shadow.cast import ShadowConfig
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
 
-MAX_EMITTERS = 2**14  #: of one bounce; `Surroundings.seen` numbers their sides in 16 bits
+MAX_EMITTERS = 2**14  #: of one bounce; `Surroundings.met` numbers their sides in 16 bits
 MAX_EXPOSURE = 40  #: of an exposure, as large as a scene's camera can have
 
 

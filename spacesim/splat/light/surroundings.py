@@ -43,7 +43,9 @@ CELLS = 1 << 10  #: on a side of the model, along whose curve emitters are chose
 MIDDLE_STEP = 0.25  #: of the model's radius: the curve's cube moves by so much at least
 SOME = 10_000  #: Gaussians that say where the middle of a model is
 SKY = 0xFFFF  #: in place of an emitter's side: nothing
-LEVEL = 0.1  #: cosine to the normal up to which a ray is along the surface: normals turn until rays are traced again
+#: cosine to the normal up to which a ray is along the surface. Normals turn until rays are traced again, early in
+#: training by more than that; with 0.3 pictures are as good
+LEVEL = 0.1
 SOURCE = "surfaces.source"  #: in checkpoints
 GONE = 0xFFFFFFFF  #: in place of a Gaussian's number
 RAYS_AT_ONCE = {"cuda": 1 << 25, "llvm": 1 << 21}  #: so that they take little memory
@@ -104,8 +106,8 @@ class Surroundings:
     #: where a Gaussian's rays stand in `met`, [4 N], row by row: the first; the first on the side to which its normal
     #: does not point; one past the last on the other; one past the last. Those along the surface (`LEVEL`) are on both
     bounds: UInt32
-    #: the Gaussians by how many they are on the side that has fewer, the one seen as a rule: threads that run together
-    #: take as long, and the longest begin first. Then the numbers from N up to `round_capacity(N)`
+    #: the Gaussians by how many of their rays are on the side that has fewer, as a rule the one that is seen: threads
+    #: that run together take as long, and the longest begin first. Then the numbers from N up to `round_capacity(N)`
     order: UInt32
     directions: list[Float]  #: a ray's is a record, see `records.load`
 
@@ -123,7 +125,7 @@ class Surroundings:
             numbers = np.where(is_gone, np.argmin(is_gone), np.arange(len(emitters)))
             emitters = emitters[np.maximum.accumulate(numbers)]
         bounds = self.bounds.numpy().reshape(4, count)[:, sources]
-        return Surroundings(upload(emitters, ad.UInt32), self.met, *_in_order(bounds), self.directions)
+        return Surroundings(upload(emitters, ad.UInt32), self.met, *_bounds_and_order(bounds), self.directions)
 
 
 class HeldSurroundings:
@@ -218,7 +220,7 @@ def _check_memory(numbers: int, count: int) -> None:
     """Raise MemoryError where so many numbers do not fit into memory. count: Gaussians"""
     work = f"light that bounces onto {count} Gaussians"
     if numbers >= 2**32:
-        raise MemoryError(f"{work}: {numbers:.3g} rays, at most {2**32:.3g} have numbers")
+        raise MemoryError(f"{work} has more rays than 32 bits can number")
     check_free_memory(4 * numbers, work)
 
 
@@ -249,9 +251,9 @@ def _met(seen: UInt32, normals: Array3f, directions: list[Float], rays: int) -> 
     dr.eval(numbers)
     before, along, behind = (number.numpy().astype(np.int64) for number in numbers)
     end = np.cumsum(before + along + behind)
-    total = int(end[-1]) if len(end) else 0
-    _check_memory(total, dr.width(normals))
-    target = dr.zeros(ad.UInt32, round_capacity(total))
+    capacity = round_capacity(int(end[-1]))
+    _check_memory(capacity, len(end))
+    target = dr.zeros(ad.UInt32, capacity)
     dr.eval(target)
     bounds = np.stack([end - behind - along - before, end - behind - along, end - behind, end]).astype(np.uint32)
 
@@ -265,14 +267,14 @@ def _met(seen: UInt32, normals: Array3f, directions: list[Float], rays: int) -> 
     first = [upload(row, ad.UInt32) for row in bounds[:3]]
     dr.while_loop((ad.UInt32(0), first), has_more, write_met, mode="symbolic", label="list rays")
     dr.eval(target)
-    return target, *_in_order(bounds)
+    return target, *_bounds_and_order(bounds)
 
 
-def _in_order(bounds: Indices) -> tuple[UInt32, UInt32]:
+def _bounds_and_order(bounds: Indices) -> tuple[UInt32, UInt32]:
     """(`Surroundings.bounds`, order) of [4, N]."""
     first, behind, past, end = bounds
-    fewer = np.minimum(past - first, end - behind).astype(np.int64)
-    order = np.argsort(-fewer, kind="stable")
+    missing = MOST_RAYS - np.minimum(past - first, end - behind)
+    order = np.argsort(missing.astype(np.uint16), kind="stable")
     beyond = np.arange(len(order), round_capacity(len(order)))
     return upload(bounds.ravel(), ad.UInt32), upload(np.concatenate([order, beyond]).astype(np.uint32), ad.UInt32)
 

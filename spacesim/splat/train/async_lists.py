@@ -1,8 +1,10 @@
-"""Tile lists of training without a wait: with a capacity for as many pairs as a view is expected to have.
+"""Tile lists of training without a wait: with a capacity for as many pairs as a view is expected to have. Likewise the
+Gaussians that a view shows (`ViewPairs.room_for`).
 
 The trainer makes the lists of a view with what a view's `PairCounts` expect, computes with them, and before it keeps
-anything of that asks `all_fit`. Where a capacity was too small, lists were empty: it computes again, `synchronous`. So
-what is learned is the same to the bit as with waits, and the host waits for a number that the device has long had.
+anything of that asks `all_fit`. Where a capacity was too small, lists were empty, or not all were lit that show: it
+computes again, `synchronous`. So what is learned is the same to the bit as with waits, and the host waits for a number
+that the device has long had.
 """
 
 from collections import deque

@@ -116,9 +116,9 @@ class TrainConfig:
     supersample: int = 1  #: places on a side of each pixel, whose mean light it is, in training and the run's pictures
     light: LightConfig | None = None  #: how the Sun makes colours; none for `vanilla`, whose colours are fixed
     #: of methods of light: Gaussians that weigh no more in any pixel of a view are black and in shadow in its step, and
-    #: learn neither from it, so that networks leave them out; of what weighs nothing nothing is lost. Counts as
-    #: `refinement.prune_opacity` at most, half of what a reset of opacities leaves; networks of fewer than 128 units
-    #: leave out none on CUDA, where it takes as long
+    #: learn neither from it, so that networks leave them out. 0 changes no picture: fields of 128 units and more leave
+    #: out what weighs nothing, narrower ones none; on CUDA these, for which it takes as long, never do. Counts as
+    #: `refinement.prune_opacity` at most, half of what a reset of opacities leaves
     hidden_weight: float = 0.0
     visibility_weight: float = 0.0  #: weight in the loss: mean error of blended visibility against the path-traced one
     isotropy_weight: float = 0.0  #: weight: mean distance of the scales from a Gaussian's mean scale, per scene scale

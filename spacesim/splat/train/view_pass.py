@@ -44,9 +44,8 @@ from spacesim.splat.train.stages import (
 from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.views import TrainingView
 
-WIDE = (
-    128  #: units of the field's layers from which on to find Gaussians that show nothing takes less than to light them
-)
+#: units of the field from which on it takes less time to find the Gaussians that show nothing than to light them
+WIDE = 128
 KEPT = 4096  #: cameras whose numbers are kept: a training shows the same ones again and again
 
 
@@ -176,7 +175,7 @@ class ViewPass:
             values["color"] = shading.colors
             if config.visibility_weight > 0 and shading.visibility is not None:
                 values["visibility"] = [shading.visibility]
-        if drawn is not None:  # after shading, which needs memory of its own
+        if drawn is not None:  # after shading, which needs memory of its own, where it does not need the lists
             lists, drawn = _lists_of(drawn, extent, pairs), None
         tape, channels = blend_view(splats, values, lists, camera)
         return RenderedView(camera, downscale, radii, channels, shading, tape)

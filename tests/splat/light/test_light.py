@@ -20,6 +20,7 @@ from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import read_points, write_points
 from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.export.bake import bake
+from spacesim.splat.light import bounce
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
@@ -446,6 +447,31 @@ def test_of_more_chosen_gaussians_than_there_is_room_for_the_first_are_lit():
     assert not lit[2048:].any()
     gradients = light.adjoint(shading, [dr.opaque(ad.Float, 1, count) for _ in range(3)])
     assert np.isfinite(numbers(gradients.features)).all()
+
+
+def test_rays_of_a_turn_are_summed_up_one_after_another(monkeypatch):
+    """CUDA takes some at once."""
+    light, splats = model("gloss"), gaussians(300, model("gloss").config.features)
+    around, emitters = light.surroundings(splats), light.config.bounce
+    scatterers = bounce.Scatterers(splats.features, light.config.field.features, light.config.albedos, ad.Array3f(SUN))
+    emitted = [upload(np.random.default_rng(5).uniform(size=8 * emitters))]
+    batch, received = PaddedBatch.of(300), []
+    for turn in (1, 3, 4):
+        monkeypatch.setattr(bounce, "TURN", dict.fromkeys(bounce.TURN, turn))
+        rows = bounce.received_on_seen(
+            scatterers,
+            around,
+            emitted,
+            emitters,
+            batch,
+            directions=lambda rays: eye().directions_to(rays.repeat_last(splats.means)),
+            diffuse=True,
+            mirrors=True,
+        )
+        received.append(np.stack([numbers(row) for row in rows]))
+    assert (received[0][:, :300].max(axis=1) > 0).all()
+    np.testing.assert_array_equal(received[1], received[0])
+    np.testing.assert_array_equal(received[2], received[0])
 
 
 def difference(function) -> float:

@@ -143,7 +143,7 @@ def test_too_many_rays_for_the_memory_are_refused(monkeypatch):
     with pytest.raises(MemoryError, match="light that bounces onto 5 Gaussians needs about"):
         look_around(surfaces(5), 10, RADIUS)
     assert not free
-    with pytest.raises(MemoryError, match=r"4.29e\+09 have numbers"):
+    with pytest.raises(MemoryError, match="onto 5 Gaussians has more rays than 32 bits"):
         surroundings_module._check_memory(2**32, 5)
 
 
