@@ -3,10 +3,10 @@
     python benchmarks/light.py [--methods relight,shadow-map] [--preset fast] [--sizes 31622x1024] [--markdown]
 
 The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
-long they take does not depend on what they have learned. A frame is what `spacesim render RUN --sun AZ,EL` draws, left
-on the device, each time under another Sun. "shadows" casts them, "field" is the networks, "draw" the picture, both
-differences of medians, which a host that drifts may push below 0; "kernels" is what the device alone needs. The
-thesis's frames (RTX 5000 Ada) stand beside ours.
+long these take does not depend on what they have learned, but light that bounces and who is hidden are the sphere's. A
+frame is what `spacesim render RUN --sun AZ,EL` draws, left on the device, each time under another Sun. "shadows" casts
+them, "field" is the networks, "draw" the picture, both differences of medians, which a host that drifts may push below
+0; "kernels" is what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
 """
 
 import sys

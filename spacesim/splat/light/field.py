@@ -130,6 +130,10 @@ class FieldInputs:
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
     beams: list[Float]  #: the Earth's, Float [4 * BEAMS] in a list, or nothing
 
+    def directions(self, batch: PaddedBatch) -> Array3f:
+        """Array3f [3, M], unit, from the camera to the batch's Gaussians."""
+        return self.camera.directions_to(batch.repeat_last(self.means))
+
 
 def field_items(config: FieldConfig, features: Float, views: list[Float], batch: PaddedBatch) -> TensorXf:
     """Items of the network (4.2): TensorXf [B, C, m]. features: packed;  views: of `field_views`"""
@@ -138,7 +142,7 @@ def field_items(config: FieldConfig, features: Float, views: list[Float], batch:
 
 def field_views(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> list[Float]:
     """What stands behind the features among the network's inputs, and changes with Sun and camera: Floats [M]."""
-    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+    direction = inputs.directions(batch)
     rows: list[Float] = config.view(direction)
     if config.surface:
         rows += surface_cosines(_normals(config, inputs, batch), direction, inputs.sun)
@@ -154,7 +158,7 @@ def sun_facing(config: FieldConfig, inputs: FieldInputs, views: list[Float], bat
 
 def earthlight(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> list[Float]:
     """[M] of `earth_irradiance` in a list; nothing where there is no Earth."""
-    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+    direction = inputs.directions(batch)
     return [earth_irradiance(_normals(config, inputs, batch), direction, beams) for beams in inputs.beams]
 
 
@@ -170,7 +174,7 @@ def normals_adjoint(
     `earthlight`."""
     normals = _normals(config, inputs, batch)
     dr.enable_grad(normals)
-    direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+    direction = inputs.directions(batch)
     cosines = surface_cosines(normals, direction, inputs.sun)
     first = config.features + config.view.size
     along = sum((cosine * row_of(grad_items, first + i) for i, cosine in enumerate(cosines)), ad.Float(0))
@@ -197,7 +201,7 @@ def sun_adjoint(
     dr.enable_grad(sun)
     along = ad.Float(0)
     if config.surface:
-        direction = inputs.camera.directions_to(batch.repeat_last(inputs.means))
+        direction = inputs.directions(batch)
         cosines = surface_cosines(_normals(config, inputs, batch), direction, sun)
         first = config.features + config.view.size
         for i, cosine in enumerate(cosines):
@@ -213,13 +217,13 @@ def sun_adjoint(
 
 def is_back_side_seen(config: FieldConfig, inputs: FieldInputs, batch: PaddedBatch) -> Bool:
     """Bool [M]: is the side seen to which the learned normal does not point?"""
-    return points_away(_normals(config, inputs, batch), inputs.camera.directions_to(batch.repeat_last(inputs.means)))
+    return points_away(_normals(config, inputs, batch), inputs.directions(batch))
 
 
 def _faces(lambert: Float, inputs: FieldInputs, batch: PaddedBatch) -> Float:
     """Of n . s of the learned normals."""
     axis = shortest_axis(*(batch.repeat_last(dr.detach(turn)) for turn in inputs.rotations_and_scales))
-    axis = seen_side_normals(axis, inputs.camera.directions_to(batch.repeat_last(inputs.means)))
+    axis = seen_side_normals(axis, inputs.directions(batch))
     return dr.clip(1 + dr.maximum(lambert, dr.dot(axis, inputs.sun)) / TURNED, 0, 1)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Array3f, Float, UInt32
+from spacesim.backend.arrays import Float, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.learning.reflectance import surface_cosines
@@ -41,9 +41,7 @@ from spacesim.splat.light.field import (
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading_inputs import ShadingInputs
 from spacesim.splat.light.shadow.light_camera import towards_sun
-from spacesim.splat.light.shadow.refine import (
-    refine_occlusion,
-)
+from spacesim.splat.light.shadow.refine import refine_occlusion
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
 from spacesim.splat.raster.seen import Chosen
 from spacesim.splat.raster.surface import across
@@ -307,13 +305,7 @@ def _received(
     """Of `received_on_seen`; nothing where nothing is emitted."""
     if not emitted or inputs.surroundings is None:
         return []
-    camera, scatterers = inputs.camera, _scatterers(config, inputs)
-    assert camera is not None
-
-    def directions(rays: PaddedBatch) -> Array3f:
-        return camera.directions_to(rays.repeat_last(inputs.means))
-
-    around = inputs.surroundings
+    scatterers, directions, around = _scatterers(config, inputs), inputs.of_field().directions, inputs.surroundings
     return received_on_seen(scatterers, around, emitted, config.bounce, batch, directions, diffuse, mirrors)
 
 

@@ -241,9 +241,12 @@ def _met(seen: UInt32, normals: Array3f, directions: list[Float], rays: int) -> 
             before, behind = cosine > LEVEL, cosine < -LEVEL
             yield ray << 16 | side, [(side != SKY) & part for part in (before, ~(before | behind), behind)]
 
+    def counted(numbers: list[UInt32], parts: list[Bool]) -> list[UInt32]:
+        return [number + dr.select(part, ad.UInt32(1), 0) for number, part in zip(numbers, parts, strict=True)]
+
     def count_met(pair: UInt32, numbers: list[UInt32]) -> tuple[UInt32, list[UInt32]]:
         for _, parts in met(pair):
-            numbers = [number + dr.select(part, ad.UInt32(1), 0) for number, part in zip(numbers, parts, strict=True)]
+            numbers = counted(numbers, parts)
         return pair + 1, numbers
 
     nothing = [dr.zeros(ad.UInt32, dr.width(normals)) for _ in range(3)]
@@ -261,7 +264,7 @@ def _met(seen: UInt32, normals: Array3f, directions: list[Float], rays: int) -> 
         for value, parts in met(pair):
             for place, part in zip(places, parts, strict=True):
                 dr.scatter(target, value, place, part)
-            places = [place + dr.select(part, ad.UInt32(1), 0) for place, part in zip(places, parts, strict=True)]
+            places = counted(places, parts)
         return pair + 1, places
 
     first = [upload(row, ad.UInt32) for row in bounds[:3]]

@@ -16,7 +16,7 @@ from spacesim.backend import select
 from spacesim.backend.arrays import UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.splat.raster.lists.boxes import Boxes
-from spacesim.splat.raster.lists.capacity import LONG, Extent, has_memory, list_capacity
+from spacesim.splat.raster.lists.capacity import LONG, Extent, has_memory, list_capacity, rounded_pairs
 from spacesim.splat.raster.lists.tiles import round_capacity
 
 HISTORY = 16  #: changes from a view's last visit to the next, of which the largest counts
@@ -115,7 +115,7 @@ class ViewPairs:
     def expected(self, extent: Extent) -> int | None:
         """By its forecast, where that fits into memory; where it does not, the pairs that there are may. Of long lists
         the wait is short beside the work."""
-        capacity = self.forecast.capacity_for(self._key(extent)) if self.training.is_async else None
+        capacity = self._forecast(extent)
         if capacity is None or capacity >= LONG or not has_memory(capacity, extent):
             return None
         return capacity
@@ -128,22 +128,27 @@ class ViewPairs:
         """See `PairCounts`."""
         pairs = boxes.pairs
         capacity = list_capacity(pairs, extent)
-        if self.training.is_async:
-            self.forecast.observe(self._key(extent), pairs)
+        self._observe(extent, pairs)
         return capacity
 
     def room_for(self, extent: Extent, number: UInt32) -> int:
         """Capacity for as many splats of the view's as `number` says, of width 1, 0 of none: without a wait where it is
         expected, and then they may be more."""
-        capacity = self.forecast.capacity_for(self._key(extent)) if self.training.is_async else None
-        if capacity is not None:
-            capacity = min(capacity, extent.most)
-            self.check(extent, number, capacity)
-            return capacity
-        count = int(number[0])
+        forecast = self._forecast(extent)
+        if forecast is None:
+            count = int(number[0])
+            self._observe(extent, count)
+            return rounded_pairs(count, few_sizes=False)
+        capacity = min(forecast, extent.most)
+        self.check(extent, number, capacity)
+        return capacity
+
+    def _forecast(self, extent: Extent) -> int | None:
+        return self.forecast.capacity_for(self._key(extent)) if self.training.is_async else None
+
+    def _observe(self, extent: Extent, count: int) -> None:
         if self.training.is_async:
             self.forecast.observe(self._key(extent), count)
-        return round_capacity(count) if count else 0
 
     def _key(self, extent: Extent) -> Hashable:
         return self.view, extent.width, extent.height
