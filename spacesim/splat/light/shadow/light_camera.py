@@ -80,30 +80,39 @@ def fit_camera(
     shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities
     means, log_scales, quaternions, logits = (batch.repeat_last(dr.detach(values)) for values in shapes)
     drawn = drawable_mask(means, log_scales, quaternions, logits) & batch.is_real()
-    means, log_scales = dr.select(drawn, means, ad.Array3f(0)), dr.select(drawn, log_scales, ad.Array3f(0))
+    near = _some_point(dr.detach(gaussians.means))
+    offset = dr.select(drawn, means - near, ad.Array3f(0))
+    columns, scales = principal_axes(quaternions), dr.exp(dr.select(drawn, log_scales, ad.Array3f(0)))
     counted = dr.select(drawn, ad.Float(1), 0)
-    [(total, *sums)] = _reduced(batch, (dr.ReduceOp.Add, [counted, *means]))
-    share = dr.rcp(dr.maximum(total, 1))
-    middle = ad.Array3f([axis_sum * share for axis_sum in sums])
-    offset, columns, scales = means - middle, principal_axes(quaternions), dr.exp(log_scales)
+    axes = [_axis(light, i) for i in range(2)]
     ends, squares = [], []
-    for i in range(2):
-        axis = _axis(light, i)
+    for axis in axes:
         across = dr.dot(axis, offset)
         spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
         support = SUPPORT * dr.sqrt(spread2)  # 4.31
         ends += [dr.select(drawn, end, MAX_MAGNITUDE) for end in (across - support, -across - support)]
-        squares.append(counted * dr.fma(across, across, spread2))
-    lowest_ends, spreads = _reduced(batch, (dr.ReduceOp.Min, ends), (dr.ReduceOp.Add, squares))  # 4.32
+        squares.append(dr.select(drawn, dr.fma(across, across, spread2), 0))
+    added = [counted, *offset, *squares]
+    lowest_ends, (total, *sums) = _reduced(batch, (dr.ReduceOp.Min, ends), (dr.ReduceOp.Add, added))  # 4.32
+    share = dr.rcp(dr.maximum(total, 1))
+    shift = ad.Array3f([axis_sum * share for axis_sum in sums[:3]])
     bounds = []
-    for i, square in enumerate(spreads):
-        lowest, highest = lowest_ends[2 * i], -lowest_ends[2 * i + 1]
+    for i, (axis, square) in enumerate(zip(axes, sums[3:], strict=True)):
+        mean = dr.dot(axis, shift)
+        lowest, highest = lowest_ends[2 * i] - mean, -lowest_ends[2 * i + 1] - mean
         if crop:
-            limit = REACH * dr.sqrt(square * share)
+            limit = REACH * dr.sqrt(dr.maximum(dr.fma(-mean, mean, square * share), 0))
             lowest, highest = dr.maximum(lowest, -limit), dr.minimum(highest, limit)
         some = lowest < highest
         bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
+    middle = dr.select(total > 0, near + shift, ad.Array3f(0))
     return _camera(light, middle, bounds, size)
+
+
+def _some_point(means: Array3f) -> Array3f:
+    """Of width 1: a place among the Gaussians, about which sums do not cancel far from the world's origin."""
+    point = ad.Array3f([dr.gather(ad.Float, row, ad.UInt32(0)) for row in means])
+    return dr.select(dr.all(dr.abs(point) < MAX_MAGNITUDE), point, ad.Array3f(0))
 
 
 def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float]]) -> list[list[Float]]:
