@@ -96,9 +96,11 @@ def _in_columns(values: list[Float], rays: PaddedBatch, batch: PaddedBatch) -> l
     """Values [M] of the Gaussians of `rays`, a `_sorted_batch`, as the batch has these."""
     if rays is batch:
         return values
-    columns = [dr.zeros(ad.Float, batch.capacity) for _ in values]
+    is_real, own = rays.is_real(), dr.arange(ad.UInt32, batch.capacity)
+    place = dr.select(is_real, rays.numbers(), own)
+    columns = [dr.empty(ad.Float, batch.capacity) for _ in values]
     for column, value in zip(columns, values, strict=True):
-        dr.scatter(column, value, rays.numbers(), rays.is_real(), dr.ReduceMode.Permute)
+        dr.scatter(column, dr.select(is_real, value, 0), place, mode=dr.ReduceMode.Permute)
     dr.eval(columns)
     return columns
 

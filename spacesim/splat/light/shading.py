@@ -3,12 +3,13 @@
 Each kernel is recorded once for all Gaussians in columns of few sizes (`PaddedBatch`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Float, TensorXf, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.learning.reflectance import surface_cosines
@@ -49,6 +50,10 @@ from spacesim.splat.raster.tone import decode_srgb
 
 SIDES = 4  #: from which what bounces is seen where it comes from
 
+_Shares = Callable[[UInt32], list[Float]]
+"""Emitters, by their places in `Surroundings.emitters`, to the share of the Sun that each sees: in a list, or nothing
+for 1."""
+
 
 @dataclass
 class ShadingTape:
@@ -70,15 +75,16 @@ def shade(
     field_weights, refine_weights = split_weights(config, weights)
     field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
+    of_refinement = _refine_items(config, inputs, batch)  # written in one kernel with the field's
     items = field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, inputs.sun.field_encoding)
     colors = [field_color(config.decoding, value) for value in output]
-    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch)
+    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch, of_refinement)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     visibility = [1 - value for value in occlusion]
     outputs = _dimmed(inputs.sun, colors, visibility, faces)
     dr.eval(outputs, colors, occlusion, visibility, faces)
-    shares = _emitters_visibility(config, refine_weights, inputs, batch, visibility)
+    shares = _emitters_shares(config, refine_weights, inputs, batch, visibility)
     emitted = _emitted(config, field_weights, inputs, shares, batch, field_tape.input_layer)
     light = _received(config, inputs, emitted, batch, diffuse=True, mirrors=config.mirrors)
     scattered = _scattered(config, inputs, light[:3], light[3:], batch)
@@ -129,7 +135,7 @@ def shade_picture(
 def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
     """Of the Sun, refined, [N]."""
     _, refine_weights = split_weights(config, weights)
-    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, batch)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, batch, _refine_items(config, inputs, batch))
     visibility = 1 - occlusion[0]
     dr.eval(visibility)
     return batch.unpad([visibility], inputs.means.x)[0]
@@ -141,7 +147,7 @@ def scatter_sunlight(
 ) -> tuple[list[Float], list[Float]]:
     """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
     field_weights, _ = split_weights(config, weights)
-    emitted = _emitted(config, field_weights, inputs, _of_emitters(inputs, visibility), batch)
+    emitted = _emitted(config, field_weights, inputs, _shares_of(inputs, visibility), batch)
     bounced: list[Float] = []
     if emitted and inputs.surroundings:
         scatterers = _scatterers(config, inputs)
@@ -172,14 +178,21 @@ def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
     return visibility * faces[0] if faces else visibility
 
 
+def _refine_items(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf | None:
+    return inputs.refine_items(config.refine, config.field.stored, batch) if config.refine else None
+
+
 def _refine_occlusion(
-    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+    config: LightConfig,
+    refine_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    items: TensorXf | None,
 ) -> tuple[list[Float], network.MlpTape | None]:
-    """([refined occlusion [M]] or [], tape of the refinement)."""
+    """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`"""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
-    if not config.refine:
+    if not config.refine or items is None:
         return occlusion, None
-    items = inputs.refine_items(config.refine, config.field.stored, batch)
     (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
@@ -263,40 +276,45 @@ def _emitted(
     config: LightConfig,
     weights: list[Float],
     inputs: ShadingInputs,
-    visibility: list[Float],
+    shares: _Shares,
     batch: PaddedBatch,
     input_layer: network.InputLayer | None = None,
 ) -> list[Float]:
-    """What `emission` gives, or nothing. weights: of the field;  visibility: of the emitters in a list, or nothing for
-    1;  input_layer: of the field, if it is known"""
+    """What `emission` gives, or nothing. weights: of the field;  input_layer: of the field, if it is known"""
     surroundings = inputs.surroundings
     if surroundings is None:
         return []
     scatterers, emitters = _scatterers(config, inputs), surroundings.emitters
     if config.mirrors:
-        light = _painted(config, weights, inputs, visibility, emitters, batch.count, input_layer)
+        light = _painted(config, weights, inputs, shares, emitters, batch.count, input_layer)
     else:
-        light = albedo_radiance(scatterers, visibility, emitters, batch.count)
+        light = albedo_radiance(scatterers, shares(dr.arange(ad.UInt32, config.bounce)), emitters, batch.count)
     return emission(scatterers, surroundings, config.bounce, light, batch.count)
 
 
-def _of_emitters(inputs: ShadingInputs, values: list[Float]) -> list[Float]:
-    """Of arrays of all Gaussians; nothing where nothing is emitted."""
-    emitters = inputs.surroundings.emitters if inputs.surroundings else None
-    return [] if emitters is None else [dr.gather(ad.Float, array, emitters) for array in values]
+def _shares_of(inputs: ShadingInputs, visibility: list[Float]) -> _Shares:
+    """Of the visibility of all Gaussians, evaluated, in a list, or nothing for 1."""
+
+    def shares(k: UInt32) -> list[Float]:
+        assert inputs.surroundings is not None, "something is emitted"
+        number = dr.gather(ad.UInt32, inputs.surroundings.emitters, k)
+        return [dr.gather(ad.Float, array, number) for array in visibility]
+
+    return shares
 
 
-def _emitters_visibility(
+def _emitters_shares(
     config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visible: list[Float]
-) -> list[Float]:
-    """Of the Sun, of each emitter in a list, or nothing. visible: of the batch, in which emitters may be missing"""
+) -> _Shares:
+    """visible: of the batch, evaluated, in which emitters may be missing"""
     if batch.chosen is None or inputs.surroundings is None:
-        return _of_emitters(inputs, visible)
+        return _shares_of(inputs, visible)
     emitters = Chosen(ad.UInt32(config.bounce), inputs.surroundings.emitters, None)
     columns = PaddedBatch.with_room_for(config.bounce, batch.count, emitters)
-    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns)
+    items = _refine_items(config, inputs, columns)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns, items)
     dr.eval(occlusion)
-    return [1 - dr.gather(ad.Float, value, dr.arange(ad.UInt32, config.bounce)) for value in occlusion]
+    return lambda k: [1 - dr.gather(ad.Float, value, k) for value in occlusion]
 
 
 def _received(
@@ -313,7 +331,7 @@ def _painted(
     config: LightConfig,
     weights: list[Float],
     inputs: ShadingInputs,
-    visibility: list[Float],
+    shares: _Shares,
     emitters: UInt32,
     gaussians: UInt32,
     input_layer: network.InputLayer | None,
@@ -322,7 +340,7 @@ def _painted(
     each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the
     Sun.
 
-    weights: of the field;  visibility, input_layer: as in `_emitted`
+    weights, input_layer: as in `_emitted`
     """
     field, count = config.field, config.bounce
     columns = PaddedBatch.with_room_for(SIDES * count, gaussians)
@@ -337,8 +355,8 @@ def _painted(
     items = columns.matrix(rows, field.shape.rows)
     output, _ = mlp.forward(field.shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
     colors = [field_color(config.decoding, value) for value in output]
-    for share in visibility:
-        colors = [color * dr.gather(ad.Float, share, column // SIDES) for color in colors]
+    for share in shares(column // SIDES):
+        colors = [color * share for color in colors]
     light = colors if config.linear else [decode_srgb(color) for color in colors]
     dr.eval(light)
     index = SIDES * dr.arange(ad.UInt32, count)

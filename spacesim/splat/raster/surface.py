@@ -122,6 +122,11 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
     deviations of the longest axis before and behind it. Not differentiable. capacity: length of the splats' arrays
     (`round_capacity`)
     """
+    return depth_on_planes(depth_planes(gaussians, splats, camera, capacity), index, camera, capacity)
+
+
+def depth_planes(gaussians: Gaussians, splats: Splats, camera: Projection, capacity: int) -> list[Float]:
+    """What `depth_on_planes` reads of each Gaussian."""
     splats = dr.detach(splats)
     means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
     least = dr.minimum(scales[0], dr.minimum(scales[1], scales[2]))
@@ -138,11 +143,13 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
     slopes = [across / (square * screen.scale_x), along / (square * screen.scale_y)]
     numbers = [splats.x, splats.y, *slopes, splats.depth, REACH * dr.exp(most)]
     splat = dr.arange(ad.UInt32, dr.width(splats.depth))
-    packed = [store(values, splat, capacity) for values in packets(numbers)]
-    dr.eval(packed)
+    return [store(values, splat, capacity) for values in packets(numbers)]
 
+
+def depth_on_planes(planes: list[Float], index: UInt32, camera: Projection, capacity: int) -> Float:
+    """`surface_depth` of `depth_planes`."""
     is_hit = index != NONE
-    x, y, slope_x, slope_y, depth, reach, *_ = load(packed, index, capacity, is_hit)
+    x, y, slope_x, slope_y, depth, reach, *_ = load(planes, index, capacity, is_hit)
     pixel = dr.arange(ad.UInt32, camera.width * camera.height)
     offset = slope_x * (x - 0.5 - ad.Float(pixel % camera.width))
     offset += slope_y * (y - 0.5 - ad.Float(pixel // camera.width))

@@ -22,7 +22,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats, project
-from spacesim.splat.raster.surface import NONE, surface_depth, walk
+from spacesim.splat.raster.surface import NONE, depth_on_planes, depth_planes, walk
 
 Filter = Literal["bilinear", "percentage-closer", "variance", "median"]
 FILTERS: tuple[Filter, ...] = get_args(Filter)
@@ -154,9 +154,9 @@ def _median_shadow_map(
     gaussians: Gaussians, splats: Splats, lists: TileLists, camera: Orthographic, capacity: int
 ) -> ShadowMap:
     """Where half of the light is gone: the surface of the Gaussian that takes it."""
+    planes = depth_planes(gaussians, splats, camera, capacity)  # written in one kernel with what the walk reads
     splat = walk(splats, lists, camera.width, camera.height, capacity)
-    dr.eval(splat)
-    depth = surface_depth(gaussians, splats, splat, camera, capacity)
+    depth = depth_on_planes(planes, splat, camera, capacity)
     alpha = dr.select(splat != NONE, ad.Float(1), 0)
     dr.eval(alpha, depth)
     return ShadowMap(alpha, depth, None, camera.width, camera.height)
