@@ -181,6 +181,15 @@ class TrainConfig:
         weights = {"depth": self.depth_weight, "normal": self.normal_weight}
         return tuple(name for name, weight in weights.items() if weight > 0)
 
+    def penalty_weights(self, unit: float) -> dict[str, float]:
+        """Of the penalties on Gaussians that there are, see `loss.terms.penalty`. unit: of length, metres"""
+        weights = {
+            "isotropy": self.isotropy_weight / unit,
+            "scale": self.scale_weight / unit,
+            "opacity": self.opacity_weight,
+        }
+        return {name: weight for name, weight in weights.items() if weight > 0}
+
     @property
     def refine_stop(self) -> int:
         """Iterations after which Gaussians stay as many: what densification leaves is trained."""

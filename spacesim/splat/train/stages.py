@@ -237,6 +237,10 @@ def picture_loss(
     return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
 
 
+NetworkStep = tuple[list[Float], tuple[list[Float], list[Float]], list[list[Float]], Float]
+"""What `update_light` takes."""
+
+
 def update_light(
     weights: list[Float], moments: tuple[list[Float], list[Float]], gradients: list[list[Float]], factors: Float
 ) -> tuple[list[Float], list[Float], list[Float]]:

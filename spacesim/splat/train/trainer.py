@@ -14,7 +14,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
@@ -40,7 +40,7 @@ from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import TargetImage, update_light
+from spacesim.splat.train.stages import NetworkStep, TargetImage, update_light
 from spacesim.splat.train.start import (
     initial_gaussians,
     largest_scale,
@@ -50,6 +50,7 @@ from spacesim.splat.train.start import (
     surface_normals,
 )
 from spacesim.splat.train.strategies.factory import make_strategy
+from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
@@ -110,8 +111,7 @@ class Trainer(TrainingLoop):
             self._start_radius = float(np.linalg.norm(means - centre, axis=1)[is_near(means)].max())
         self.history, self.seconds = [], {"refinement": 0.0}
         self._view_pass = ViewPass(config, self.scene_scale)
-        self._update = Update(config.antialiased, self.scene_scale, config.surfels)
-        self._update_light = recorded(update_light)
+        self._update = Update(config.antialiased, self.scene_scale, config.surfels, self._learn_beside)
 
     @property
     def gaussian_count(self) -> int:
@@ -136,10 +136,8 @@ class Trainer(TrainingLoop):
         rows = self.gaussians.rows()
         results = [self._forward_backward(rows, degree, *pair) for pair in zip(numbers, views, strict=True)]
         del rows  # so that old ones go as new ones come
-        self._step_gaussians(degree, results)
-        if self.light:
-            self._step_light(self.light, results)
-
+        losses = [result.loss for result in results]
+        self._learn(degree, results)
         self.iteration += 1
         self.pictures.hold(self.iteration)
         if self.light:
@@ -147,7 +145,6 @@ class Trainer(TrainingLoop):
         self.strategy.add_noise(self.iteration, self.gaussians, self.means_rate(index), config.seed)
         self._refine()
         self._turn_discs()
-        losses = [result.loss for result in results]
         return losses[0] if count == 1 else sum(losses, ad.Float(0)) / count
 
     def _look_around(self, light: LightModel) -> None:
@@ -204,7 +201,7 @@ class Trainer(TrainingLoop):
                 drawn, loss, grad_splats, result = self._gradients(*asked)
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
-            self.strategy.observe(view_pass.watched(drawn, grad_splats))
+            result.seen = view_pass.watched(drawn, grad_splats, number % self.config.views_per_step)
         if attraction:
             result.add_to_rows(self._add_attraction(rows, view, attraction))
         self.pictures.learn_sun(self.iteration, view, result.by_sun)
@@ -245,10 +242,29 @@ class Trainer(TrainingLoop):
         background = ad.Float(self.background(number, view).tolist())
         return TargetImage(rgba, background, valid, truth, self.pictures.gains(view))
 
-    def _step_gaussians(self, degree: int, results: list[ViewResult]) -> None:
+    def _learn(self, degree: int, results: list[ViewResult]) -> None:
+        """Move the Gaussians and the networks, and tell the strategy what the views show. results: emptied"""
+        gaussians, light, strategy, of_light = self.gaussians, self.light, self.strategy, self.light_optimizer
+        weights = self.config.penalty_weights(self.scene_scale).items()
+        penalties = {name: dr.opaque(ad.Float, weight / gaussians.count) for name, weight in weights}
         factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
         views = [result.take_gradients() for result in results]
-        self._update(self.gaussians, self.optimizer, degree, views, factors, self._penalties(), self._held_now())
+        seen = [result.seen for result in results if result.seen]
+        networks = [self._network_step(light, results)] if light else []
+        more, held = [strategy.observed_state() if seen else {}, seen, networks], self._held_now()
+        del seen, networks
+        results.clear()
+        state, moved = self._update(gaussians, self.optimizer, degree, views, factors, penalties, held, more)
+        strategy.state |= state
+        if light:
+            [(learned, of_light.first, of_light.second)] = moved
+            light.weights, light.embeddings = learned[: len(light.weights)], learned[len(light.weights) :]
+
+    def _learn_beside(
+        self, state: dict[str, Float], seen: list[OnScreen], networks: list[NetworkStep]
+    ) -> tuple[dict[str, Float], list[tuple[list[Float], list[Float], list[Float]]]]:
+        """(the strategy's state, what `update_light` gives of the networks)."""
+        return self.strategy.observe(state, seen) if seen else {}, [update_light(*step) for step in networks]
 
     def _held_now(self) -> list[Float]:
         """ln of `largest_scale` where the configuration holds sizes, once Gaussians may be split; else nothing."""
@@ -256,25 +272,13 @@ class Trainer(TrainingLoop):
         begins = max(refinement.refine_start, refinement.pause_after_reset)
         return [] if index < begins or self._warming(index) else self._held
 
-    def _penalties(self) -> dict[str, Float]:
-        """{name: weight of each Gaussian's share} of the penalties on Gaussians that the configuration has."""
-        config, count, unit = self.config, self.gaussians.count, self.scene_scale
-        weights = {
-            "isotropy": config.isotropy_weight / unit,
-            "scale": config.scale_weight / unit,
-            "opacity": config.opacity_weight,
-        }
-        return {name: dr.opaque(ad.Float, weight / count) for name, weight in weights.items() if weight > 0}
-
-    def _step_light(self, light: LightModel, results: list[ViewResult]) -> None:
+    def _network_step(self, light: LightModel, results: list[ViewResult]) -> NetworkStep:
         optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
         rate = rates.between(rates.networks, rates.networks_final, done)
         of_embeddings = rates.features * rate / (rates.networks or 1)  # as in Splatfacto-W it falls
         factors = ad.Float([*optimizer.corrections(), rate, *[of_embeddings for _ in light.embeddings]])
         gradients = [result.by_networks for result in results]
-        moments, count = (optimizer.first, optimizer.second), len(light.weights)
-        moved, optimizer.first, optimizer.second = self._update_light(_learned(light), moments, gradients, factors)
-        light.weights, light.embeddings = moved[:count], moved[count:]
+        return _learned(light), (optimizer.first, optimizer.second), gradients, factors
 
     def model_tensors(self) -> dict[str, np.ndarray]:
         """The Gaussians, and the networks where there are any."""

@@ -89,6 +89,7 @@ class ViewResult:
     loss: Float  #: Float of width 1
     by_networks: list[Float] = field(default_factory=list)  #: by their weights, then by the pictures' embeddings
     by_sun: Float | None = None  #: [3], by its direction, of pictures whose Suns are unknown
+    seen: OnScreen | None = None  #: where densification watches
 
     def add_to_rows(self, grad_rows: list[Float]) -> None:
         """Gradients of the Gaussians' first rows, Floats [N], that come from elsewhere."""
@@ -127,7 +128,7 @@ class ViewPass:
         self._loss = recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._hidden = _hidden_weight(config)
-        self._screen_sizes: dict[tuple[int, int], Float] = {}  # by width and height
+        self._screen_sizes: dict[tuple[int, int, int], Float] = {}  # by width, height, number of the view in its step
 
     def forward(
         self,
@@ -204,17 +205,18 @@ class ViewPass:
             tape.splats, tape.blended, tape.lists, size, loss.grad_planes, loss.grad_transmittance, absolute=absolute
         )
 
-    def watched(self, drawn: RenderedView, grad_splats: SplatGradients) -> OnScreen:
-        """What densification watches of a view."""
+    def watched(self, drawn: RenderedView, grad_splats: SplatGradients, place: int) -> OnScreen:
+        """What densification watches of a view. place: its number in the step"""
         assert drawn.radii is not None, "radii are there where refinement watches"
-        return OnScreen(grad_splats.absolute_x, grad_splats.absolute_y, drawn.radii, self._sizes(drawn.camera))
+        sizes = self._sizes(drawn.camera, place)
+        return OnScreen(grad_splats.absolute_x, grad_splats.absolute_y, drawn.radii, sizes)
 
-    def _sizes(self, camera: Pinhole) -> Float:
-        """Of its pictures, as `OnScreen` has them."""
-        size = camera.width, camera.height
-        if size not in self._screen_sizes:
-            self._screen_sizes[size] = ad.Float([0.5 * camera.width, 0.5 * camera.height, max(size)])
-        return self._screen_sizes[size]
+    def _sizes(self, camera: Pinhole, place: int) -> Float:
+        """Of its pictures, as `OnScreen` has them. Each place in a step has its own: see `_camera`."""
+        width, height = camera.width, camera.height
+        if (width, height, place) not in self._screen_sizes:
+            self._screen_sizes[width, height, place] = ad.Float([0.5 * width, 0.5 * height, max(width, height)])
+        return self._screen_sizes[width, height, place]
 
     def to_gradients(
         self, drawn: RenderedView, loss: ViewLoss, grad_splats: SplatGradients, light: LightModel | None

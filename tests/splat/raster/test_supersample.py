@@ -215,18 +215,17 @@ def test_training_compares_the_mean_light(tone):
         assert (numbers(loss)[0] < 0.004) == same
 
 
-def test_refinement_watches_the_same_gradients_and_sizes(small_dataset, monkeypatch):
+def test_refinement_watches_the_same_gradients_and_sizes(small_dataset):
     """As shares of the picture, however finely it is drawn."""
     found = []
     for times in (1, 2):
         config = replace(preset("demo"), init_count=200, supersample=times, antialiased=True)
         trainer = Trainer(small_dataset, config)
-        seen = []
-        monkeypatch.setattr(trainer.strategy, "observes_step", lambda _step: True)
-        monkeypatch.setattr(trainer.strategy, "observe", seen.append)
         trainer.step()
-        gradient, radius, visible = (np.array(values) for values in seen[0].measures())
-        found.append([gradient[visible].mean(), radius[visible].mean()])
+        state = {name: np.array(values) for name, values in trainer.strategy.state.items()}
+        visible = state["seen"] > 0
+        assert 20 < visible.sum() <= 200
+        found.append([state["gradient"][visible].mean(), state["radius"][visible].mean()])
     np.testing.assert_allclose(found[1], found[0], rtol=0.15)
 
 

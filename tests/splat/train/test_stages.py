@@ -74,7 +74,7 @@ def test_gaussians_too_faint_to_draw_count_as_seen():
     radius = np.array(drawn.radii)
     assert (radius > 0).tolist() == [True, True, False]
     slopes = ad.Float([0.0, 1e-3, 0.0])
-    seen = view_pass.watched(drawn, SimpleNamespace(absolute_x=slopes, absolute_y=slopes)).measures()[2]
+    seen = view_pass.watched(drawn, SimpleNamespace(absolute_x=slopes, absolute_y=slopes), 0).measures()[2]
     assert np.array(seen).tolist() == [True, True, False]
     assert (
         view_pass.forward(gaussians, gaussians.rows(), None, view, degree=0, downscale=1, watched=False).radii is None

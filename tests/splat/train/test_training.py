@@ -532,25 +532,18 @@ def test_several_views_a_step_follow_their_mean_gradient(small_dataset):
 
 
 @pytest.mark.parametrize(("decay", "shares"), [("exponential", (1.0, 0.1, 0.01)), ("quadratic", (1.0, 0.7525, 0.01))])
-def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, monkeypatch, decay, shares):
+def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, decay, shares):
     names = "means", "features", "networks"
     finals = {f"rates.{name}_final": 0.01 * getattr(LearningRates(), name) for name in names}
     config = with_settings(preset("demo", "relight"), {"rates.decay": decay, **finals})
     trainer = Trainer(small_lit_dataset, replace(config, iterations=200, init_count=50))
-    of_networks = []
-
-    def learn(learned, moments, gradients, factors):
-        of_networks.append(float(np.array(factors)[2]))
-        return learned, *moments
-
-    monkeypatch.setattr(trainer, "_update_light", learn)
     for index, share in zip((0, 100, 200), shares, strict=True):
         rates, start = trainer.rates(index), config.rates
         assert rates[0] == pytest.approx(share * start.means * trainer.scene_scale)
         assert rates[-1] == pytest.approx(share * start.features)
         trainer.iteration = index
-        trainer._step_light(trainer.light, [ViewResult(None, ad.Float(0))])
-        assert of_networks[-1] == pytest.approx(share * start.networks)
+        *_, factors = trainer._network_step(trainer.light, [ViewResult(None, ad.Float(0))])
+        assert float(factors[2]) == pytest.approx(share * start.networks)
 
 
 def test_hidden_gaussians_have_no_colour(small_lit_dataset, monkeypatch):

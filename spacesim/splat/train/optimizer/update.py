@@ -6,9 +6,10 @@ slower on a CPU. On CUDA, where kernels take less time than to ask for a functio
 whose rows fill their memory, and of those with light, whose networks take more memory than that.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import drjit as dr
 
@@ -64,12 +65,16 @@ class Update:
     antialiased: whether splats are drawn with the anti-aliasing filter
     scale: metres, the unit of depth
     surfels: whether each step ends with discs, see `flattened`
+    beside: what else a step moves, of what `__call__` is given for it; a part of its recording where all is one
     """
 
-    def __init__(self, antialiased: bool, scale: float, surfels: bool = False) -> None:
+    def __init__(
+        self, antialiased: bool, scale: float, surfels: bool = False, beside: Callable[..., Any] | None = None
+    ) -> None:
         self.antialiased, self.scale, self.surfels = antialiased, scale, surfels
         self._own, self._features = recorded(_move_own), recorded(_move_features)
-        self._harmonics, self._all = recorded(_move_harmonics), recorded(_move_all)
+        self._harmonics, self._all = recorded(_move_harmonics), recorded(self._move_all)
+        self._beside, self._beside_alone = beside, recorded(beside) if beside else None
 
     def __call__(
         self,
@@ -80,16 +85,18 @@ class Update:
         factors: Float,
         penalties: Mapping[str, Float],
         largest: Sequence[Float] = (),
-    ) -> None:
-        """Replace the parameters and their moments.
+        more: list[Any] | None = None,
+    ) -> Any:
+        """Replace the parameters and their moments. Returns what `beside` gives of `more`, its arguments, or None.
 
-        views: emptied, so that gradients go once they are read
+        views, more: emptied, so that gradients go once they are read
         factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name
         largest: ln of metres, no scale gets larger, a Float of width 1 in a list, or nothing
 
         Harmonics of no degree up to `degree` have never had a gradient: they stay as they are.
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
+        more = [] if more is None else more
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
         taught = _Taught(
             views=[(view.camera, view.grad_splats, view.grad_values, view.grad_rows) for view in views],
@@ -106,19 +113,23 @@ class Update:
         stops = [part.stop for part in optimizer.slices if part.start < OWN + 3 * (degree + 1) ** 2]
         if moves_at_once(gaussians):
             packed = list(zip(optimizer.arrays, optimizer.layouts, strict=True))[: len(stops)]
-            parts, features = self._all(rows, stops, packed, optimizer.features, taught)
+            parts, features, others = self._all(rows, stops, packed, optimizer.features, taught, more)
+            more.clear()
             for number, (moved, moments) in enumerate(parts):
                 _replace(gaussians, optimizer, rows, number, moved, moments)
         else:
+            others = self._beside_alone(*more) if more and self._beside_alone else None
+            more.clear()
             features = self._part_by_part(gaussians, optimizer, rows, stops, taught)
         if features:
             rows[-1], *optimizer.features = features
             gaussians.replace(rows)
+        return others
 
     def _part_by_part(
         self, gaussians: Gaussians, optimizer: Adam, rows: list[Float], stops: list[int], taught: _Taught
     ) -> list[Float]:
-        """See `_move_all`: replaces all but the features, which are returned."""
+        """Replaces all but the features, which are returned with their moments, or nothing."""
         means, cameras, factors = rows[:3], [camera for camera, *_ in taught.views], taught.factors
         packed = optimizer.arrays[0], optimizer.layouts[0]
         grad_sums, moved, moments = self._own(rows, stops[0], packed, taught)
@@ -135,6 +146,31 @@ class Update:
             _replace(gaussians, optimizer, rows, number, moved, moments)
             del packed, moved, moments
         return []
+
+    def _move_all(
+        self,
+        rows: list[Float],
+        stops: list[int],
+        packed: list[Packed],
+        of_features: list[Float],
+        taught: _Taught,
+        more: list[Any],
+    ) -> tuple[list[tuple[list[Float], list[Float]]], list[Float], Any]:
+        """(rows and moments of each part; the features and their moments, or nothing; of `beside`). stops: where parts
+        end;  of_features: their moments, or nothing"""
+        others = self._beside(*more) if more and self._beside else None
+        dr.schedule(others)
+        grad_sums, moved, moments = _move_own(rows, stops[0], packed[0], taught)
+        steps, factors = [(moved, moments)], taught.factors
+        if taught.grad_features:
+            return steps, _move_features(rows[-1], of_features, taught.grad_features, factors), others
+        cameras = [camera for camera, *_ in taught.views]
+        for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
+            first = (start - OWN) // 3
+            steps.append(
+                _move_harmonics(rows[start:stop], of_part, first, taught.degree, rows[:3], cameras, grad_sums, factors)
+            )
+        return steps, [], others
 
 
 def moves_at_once(gaussians: Gaussians) -> bool:
@@ -153,24 +189,6 @@ def _replace(
         gaussians.replace(rows)
     else:
         gaussians.sh = ad.ArrayXf(rows[ROWS["sh"]])
-
-
-def _move_all(
-    rows: list[Float], stops: list[int], packed: list[Packed], of_features: list[Float], taught: _Taught
-) -> tuple[list[tuple[list[Float], list[Float]]], list[Float]]:
-    """(rows and moments of each part; the features and their moments, or nothing). stops: where parts end;
-    of_features: their moments, or nothing"""
-    grad_sums, moved, moments = _move_own(rows, stops[0], packed[0], taught)
-    steps, factors = [(moved, moments)], taught.factors
-    if taught.grad_features:
-        return steps, _move_features(rows[-1], of_features, taught.grad_features, factors)
-    cameras = [camera for camera, *_ in taught.views]
-    for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
-        first = (start - OWN) // 3
-        steps.append(
-            _move_harmonics(rows[start:stop], of_part, first, taught.degree, rows[:3], cameras, grad_sums, factors)
-        )
-    return steps, []
 
 
 def _move_own(

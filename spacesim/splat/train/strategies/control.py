@@ -11,7 +11,7 @@ from typing import Literal
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError, check_ranges
@@ -118,23 +118,21 @@ class DensityControl(Strategy):
     def __init__(self, config: DensificationConfig, scene_scale: float, count: int, kept: tuple[str, ...]) -> None:
         self.config, self.scene_scale, self.kept = config, scene_scale, kept
         self.state = {name: _zeros(count) for name in (*WINDOW, *kept)}
-        self._observed = recorded(self._observation)
 
     def observes_step(self, step: int) -> bool:
         return step < self.config.refine_stop
 
-    def observe(self, seen: OnScreen) -> None:
-        state = {name: values for name, values in self.state.items() if name not in self.unseen}
-        self.state |= self._observed(state, seen)
+    def observed_state(self) -> dict[str, Float]:
+        return {name: values for name, values in self.state.items() if name not in self.unseen}
 
-    def _observation(self, state: dict[str, Float], seen: OnScreen) -> dict[str, Float]:
-        """The state with an observation more."""
-        gradient, radius, visible = seen.measures()
+    def observe(self, state: dict[str, Float], seen: list[OnScreen]) -> dict[str, Float]:
         state = dict(state)
-        state["gradient"] = state["gradient"] + dr.select(visible, gradient, 0)
-        state["seen"] = state["seen"] + dr.select(visible, ad.Float(1), 0)
-        state["radius"] = dr.maximum(state["radius"], dr.select(visible, radius, 0))
-        self._accumulate(state, gradient, radius, visible)
+        for view in seen:
+            gradient, radius, visible = view.measures()
+            state["gradient"] = state["gradient"] + dr.select(visible, gradient, 0)
+            state["seen"] = state["seen"] + dr.select(visible, ad.Float(1), 0)
+            state["radius"] = dr.maximum(state["radius"], dr.select(visible, radius, 0))
+            self._accumulate(state, gradient, radius, visible)
         return state
 
     def refine(

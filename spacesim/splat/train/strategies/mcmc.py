@@ -72,8 +72,11 @@ class McmcStrategy(Strategy):
     def observes_step(self, step: int) -> bool:
         return False
 
-    def observe(self, seen: OnScreen) -> None:
-        pass
+    def observed_state(self) -> dict[str, Float]:
+        return {}
+
+    def observe(self, state: dict[str, Float], seen: list[OnScreen]) -> dict[str, Float]:
+        return state
 
     def add_noise(self, step: int, gaussians: Gaussians, rate: float, seed: int) -> None:
         """Noise on the means (stochastic gradient Langevin dynamics): Sigma times a normal vector, times the learning

@@ -48,8 +48,12 @@ class Strategy(ABC):
         """Whether `observe` is wanted after step number `step`, the first of which is 1."""
 
     @abstractmethod
-    def observe(self, seen: OnScreen) -> None:
-        """After each view of a step."""
+    def observed_state(self) -> dict[str, Float]:
+        """What of the state observations change."""
+
+    @abstractmethod
+    def observe(self, state: dict[str, Float], seen: list[OnScreen]) -> dict[str, Float]:
+        """`observed_state` after the views of a step. Recorded: it depends on nothing else."""
 
     @abstractmethod
     def refine(

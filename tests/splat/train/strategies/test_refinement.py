@@ -117,7 +117,8 @@ def refine_once(
     zeros = np.zeros(6)
     gradient, radius = state.get("gradient", zeros), state.get("radius", zeros)
     for _ in range(2):
-        strategy.observe(on_screen(gradient, radius, np.array([True] * 5 + [False])))
+        seen = on_screen(gradient, radius, np.array([True] * 5 + [False]))
+        strategy.state |= strategy.observe(strategy.observed_state(), [seen])
     means = np.array(model.means).T.copy()
     done = strategy.refine(step, model, optimizer, np.random.default_rng(0))
     return strategy, model, means, (done.duplicated, done.split, done.pruned)

@@ -80,7 +80,7 @@ def show(strategy: Strategy, gradient, radius=None, visible=None, times: int = 1
     radius = np.zeros(count) if radius is None else radius
     visible = np.ones(count, bool) if visible is None else visible
     for _ in range(times):
-        strategy.observe(on_screen(gradient, radius, visible))
+        strategy.state |= strategy.observe(strategy.observed_state(), [on_screen(gradient, radius, visible)])
 
 
 def refine(strategy: Strategy, gaussians: Gaussians, step: int = STEP, leniency: float = 1.0):
