@@ -594,6 +594,30 @@ def test_arrays_are_read_without_synchronising(monkeypatch, library):
         np.testing.assert_array_equal(wide, np.arange(size, dtype=np.uint32) ** 2, "memory of its own")
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Dr.Jit's library may have other names")
+def test_numbers_arrive_however_many_are_sent():
+    """Memory from which numbers go is written again and again, while earlier ones may be on their way."""
+    from spacesim.backend import upload
+    from spacesim.backend.readback import copy_functions
+
+    outbox, count, functions = upload._Outbox(), 3 * upload.TURNS + 7, copy_functions()
+    assert functions is not None
+    sent = [outbox.send([0.1 * k + n for n in range(1 + k % upload.MOST)], functions) for k in range(count)]
+    for k, array in enumerate(sent):
+        expected = [np.float32(0.1 * k + n) for n in range(1 + k % upload.MOST)]
+        np.testing.assert_array_equal(np.array(array), expected, err_msg=str(k))
+
+
+@pytest.mark.parametrize("count", [0, 1, 64, 65])
+def test_numbers_of_pythons_are_rounded_to_single_precision(count):
+    from spacesim.backend.upload import upload_numbers
+
+    values = np.random.default_rng(count).normal(size=count)
+    found = upload_numbers(values.tolist())
+    assert type(found) is backend.ad.Float
+    np.testing.assert_array_equal(np.array(found), values.astype(np.float32))
+
+
 @pytest.mark.gpu
 def test_a_number_is_read_before_later_work_ends():
     if backend.select() != "cuda":

@@ -34,7 +34,7 @@ _FUNCTIONS_OF_CUDA: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "push": ("_Z21jit_cuda_push_contextPv", None, (c_void_p,)),
     "pop": ("_Z20jit_cuda_pop_contextv", c_void_p, ()),
 }
-_SHARED = 1  # memory that the host reads and the device writes; on CUDA its pages are locked: a copy to others waits
+LOCKED = 1  # memory that the host reads and the device writes; on CUDA its pages are locked: a copy to others waits
 
 
 class AsyncNumber:
@@ -71,7 +71,7 @@ class _Copy:
     """`count` entries of an array, from the `first` on, on their way to the host."""
 
     def __init__(self, array: Any, first: int, count: int) -> None:
-        functions = _functions()
+        functions = copy_functions()
         if functions is None:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
         dr = load_drjit()
@@ -81,7 +81,7 @@ class _Copy:
         if self._free is None and _local.free:
             self._slot = _local.free.pop()
         else:
-            self._slot = _HostSlot(functions["allocate"](backend, max(self._bytes, _KEPT), _SHARED))
+            self._slot = HostSlot(functions["allocate"](backend, max(self._bytes, _KEPT), LOCKED))
         self._is_pending = True
         start = c_void_p()
         variable = functions["address"](array.index, ctypes.byref(start))
@@ -113,11 +113,11 @@ class _Copy:
 
 def can_read_async() -> bool:
     """Whether Dr.Jit has what `AsyncNumber` needs."""
-    return _functions() is not None
+    return copy_functions() is not None
 
 
-class _HostSlot:
-    """Memory of the host's, and an event. Those for a number are never given back: they are few, and used again."""
+class HostSlot:
+    """Memory of the host's, and an event. Those for numbers are never given back: they are few, and used again."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -140,15 +140,15 @@ class _FreeSlots(threading.local):
     """For numbers, of a thread, whose stream the events belong to."""
 
     def __init__(self) -> None:
-        self.free: list[_HostSlot] = []
+        self.free: list[HostSlot] = []
 
 
 _local = _FreeSlots()
 
 
 @cache
-def _functions() -> dict[str, Any] | None:
-    """Of Dr.Jit's library, by name; None where one is missing."""
+def copy_functions() -> dict[str, Any] | None:
+    """Of Dr.Jit's library, by the names of `_FUNCTIONS`; None where one is missing."""
     folder = Path(str(load_drjit().__file__)).parent
     path = next((folder / name for name in _LIBRARIES if (folder / name).exists()), None)
     if path is None or not hasattr(importlib.import_module(f"drjit.{select()}"), "Event"):

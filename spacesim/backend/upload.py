@@ -1,9 +1,16 @@
-"""Arrays of numpy's become arrays of Dr.Jit's.
+"""Arrays of numpy's, and numbers of Python's, become arrays of Dr.Jit's.
 
 On LLVM, `ad.Float(values)` goes on reading numpy's own memory, and kernels read it in whole vectors, up to 60 bytes
 beyond its end: where the next page is not there, the process dies. What comes from numpy comes through here.
+
+On CUDA, Dr.Jit 1.5 gives the memory back from which it copied when the device says so: a call of the host's, for which
+all that the device was asked for since waits, on an H200 0.1 to 0.4 ms. What steps and pictures need comes through
+`upload_numbers`, whose memory stays.
 """
 
+import ctypes
+import threading
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -11,9 +18,12 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend.arrays import Array3f, Float, UInt32
-from spacesim.backend.selection import ad
+from spacesim.backend.readback import LOCKED, HostSlot, copy_functions
+from spacesim.backend.selection import ad, select
 
 VECTOR = 64  # elements of the widest vector, and more
+MOST = 64  #: numbers that `upload_numbers` sends at once
+TURNS = 256  #: until all must have arrived that were sent from the other half of its memory
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
@@ -31,6 +41,52 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
     dr.scatter(array, kind(padded[:count]), dr.arange(ad.UInt32, count))
     dr.eval(array)
     return array
+
+
+def upload_numbers(values: Sequence[float]) -> Float:
+    """Float [N] of numbers of Python's. On CUDA few of them hold up nothing, where Dr.Jit's library has what it takes
+    (`copy_functions`)."""
+    sends = 0 < len(values) <= MOST and select() == "cuda" and not dr.flag(dr.JitFlag.FreezingScope)
+    functions = copy_functions() if sends else None
+    return ad.Float(list(values)) if functions is None else _outbox.send(values, functions)
+
+
+class _Outbox(threading.local):
+    """Memory of the host's from which a thread sends numbers, in two halves by turns: one is written again when all has
+    arrived that was sent from it."""
+
+    def __init__(self) -> None:
+        self._halves: list[tuple[HostSlot, np.ndarray]] = []
+        self._sent = 0
+
+    def send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
+        array = dr.empty(ad.Float, len(values))
+        dr.make_opaque(array)
+        backend = dr.backend_v(array).value
+        if not self._halves:
+            self._halves = [_locked(functions["allocate"](backend, 4 * MOST * TURNS, LOCKED)) for _ in range(2)]
+        turn, place = divmod(self._sent, TURNS)
+        slot, memory = self._halves[turn % 2]
+        if place == 0 and turn >= 2:
+            slot.event.wait()
+        first = MOST * place
+        memory[first : first + len(values)] = values
+        address = ctypes.c_void_p()
+        variable = functions["address"](array.index, ctypes.byref(address))
+        functions["copy"](backend, address, slot.address + 4 * first, 4 * len(values))
+        functions["release"](variable)
+        self._sent += 1
+        if place == TURNS - 1:
+            slot.record(functions)
+        return array
+
+
+def _locked(address: int) -> tuple[HostSlot, np.ndarray]:
+    memory: Any = (ctypes.c_float * (MOST * TURNS)).from_address(address)
+    return HostSlot(address), np.frombuffer(memory, np.float32)
+
+
+_outbox = _Outbox()
 
 
 def upload_rows(rows: np.ndarray) -> Array3f:

@@ -9,7 +9,7 @@ import numpy as np
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt32
 from spacesim.backend.memory import check_free_memory
-from spacesim.backend.upload import upload
+from spacesim.backend.upload import upload, upload_numbers
 from spacesim.data.errors import check_ranges
 from spacesim.data.files import JsonDict
 from spacesim.data.records import Dataset
@@ -79,7 +79,7 @@ class NerfTrainer(TrainingLoop):
             self._key(index),
             dr.opaque(ad.Float, SLOPE * begun / ((SLOPE - 1) * begun + 1)),
             dr.opaque(ad.Float, float(warm)),
-            ad.Float([*corrections(index + 1), *corrections(max(self.proposal_steps, 1)), rate]),
+            upload_numbers([*corrections(index + 1), *corrections(max(self.proposal_steps, 1)), rate]),
         )
         self.parameters, self.first, self.second, loss = self._step(
             self.networks, self.parameters, self.first, self.second, self.pixels, self.filled, numbers, learn

@@ -8,6 +8,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
+from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import check_ranges
 from spacesim.data.geometry import Array
 from spacesim.data.structure import check_fields
@@ -46,6 +47,6 @@ class Encoding:
 
     def of_one(self, vector: Sequence[float] | Array) -> Float:
         """Float [size] of one vector, three numbers. They are no constants of a kernel: others compile nothing."""
-        numbers = ad.Float([float(number) for number in vector])  # no numpy array: see `backend.recorded`
+        numbers = upload_numbers([float(number) for number in vector])  # no numpy array: see `backend.recorded`
         point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])
         return dr.concat([ad.Float(term) for term in self(point)])

@@ -13,6 +13,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.records import Camera
@@ -155,7 +156,7 @@ class Pinhole(Projection):
     @staticmethod
     def of(camera: Camera) -> "Pinhole":
         """Upload a `Camera` record."""
-        return Pinhole(ad.Float(pinhole_numbers(camera)), camera.width, camera.height)
+        return Pinhole(upload_numbers(pinhole_numbers(camera)), camera.width, camera.height)
 
     @property
     def position(self) -> Array3f:
@@ -190,7 +191,8 @@ class Orthographic(Projection):
     def of(camera: OrthographicCamera) -> "Orthographic":
         """Upload an `OrthographicCamera` record."""
         intrinsics = camera.scale_x, camera.scale_y, camera.cx, camera.cy
-        return Orthographic(ad.Float(_numbers(camera.camera_from_world, intrinsics, ())), camera.width, camera.height)
+        numbers = _numbers(camera.camera_from_world, intrinsics, ())
+        return Orthographic(upload_numbers(numbers), camera.width, camera.height)
 
     def in_reach(self, center: Array3f) -> Bool:
         return dr.max(dr.abs(center)) < MAX_MAGNITUDE

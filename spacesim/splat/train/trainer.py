@@ -16,7 +16,7 @@ import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
-from spacesim.backend.upload import upload
+from spacesim.backend.upload import upload, upload_numbers
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict
 from spacesim.data.geometry import Array, is_near, robust_radius
@@ -239,7 +239,7 @@ class Trainer(TrainingLoop):
                 **truth,
                 "foreground": [attraction.mask, dr.opaque(ad.Float, self.warm_start.config.strength(self.iteration))],
             }
-        background = ad.Float(self.background(number, view).tolist())
+        background = upload_numbers(self.background(number, view).tolist())
         return TargetImage(rgba, background, valid, truth, self.pictures.gains(view))
 
     def _learn(self, degree: int, results: list[ViewResult]) -> None:
@@ -247,7 +247,7 @@ class Trainer(TrainingLoop):
         gaussians, light, strategy, of_light = self.gaussians, self.light, self.strategy, self.light_optimizer
         weights = self.config.penalty_weights(self.scene_scale).items()
         penalties = {name: dr.opaque(ad.Float, weight / gaussians.count) for name, weight in weights}
-        factors = ad.Float([*self.optimizer.corrections(), *self.rates(self.iteration)])
+        factors = upload_numbers([*self.optimizer.corrections(), *self.rates(self.iteration)])
         views = [result.take_gradients() for result in results]
         seen = [result.seen for result in results if result.seen]
         networks = [self._network_step(light, results)] if light else []
@@ -276,7 +276,7 @@ class Trainer(TrainingLoop):
         optimizer, rates, done = self.light_optimizer, self.config.rates, self.iteration / self.config.iterations
         rate = rates.between(rates.networks, rates.networks_final, done)
         of_embeddings = rates.features * rate / (rates.networks or 1)  # as in Splatfacto-W it falls
-        factors = ad.Float([*optimizer.corrections(), rate, *[of_embeddings for _ in light.embeddings]])
+        factors = upload_numbers([*optimizer.corrections(), rate, *[of_embeddings for _ in light.embeddings]])
         gradients = [result.by_networks for result in results]
         return _learned(light), (optimizer.first, optimizer.second), gradients, factors
 

@@ -12,7 +12,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
-from spacesim.backend.upload import held
+from spacesim.backend.upload import held, upload_numbers
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
 from spacesim.splat.light.padded_batch import PaddedBatch
@@ -185,7 +185,7 @@ class ViewPass:
         """With as many pixels as are blended of a view. A new array each time: two views of a step may be one, and no
         array may stand in two places of a recording's arguments."""
         numbers, width, height = self._camera_numbers(camera, downscale)
-        return Pinhole(ad.Float(numbers), width, height)
+        return Pinhole(upload_numbers(numbers), width, height)
 
     def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
         """Compare a view that was drawn. camera: of the target"""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float
+from spacesim.backend.upload import upload_numbers
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
 from spacesim.splat.light.padded_batch import PaddedBatch
@@ -53,7 +54,7 @@ def light_rows(direction: ArrayLike) -> Float:
 
 @lru_cache(maxsize=SUNS)
 def _rows(*direction: float) -> Float:
-    return ad.Float(light_axes(direction).T.ravel().tolist())
+    return upload_numbers(light_axes(direction).T.ravel().tolist())
 
 
 def towards_sun(light: Float) -> Array3f:

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from spacesim.backend import ad
 from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload_numbers
 from spacesim.data.files import JsonValue
 from spacesim.data.geometry import Array
 from spacesim.data.records import Dataset
@@ -71,7 +71,7 @@ class LearnedPictures:
         """Float [3] that the colours of a view are multiplied by."""
         if self.exposures:
             return self.exposures.gains(view.index)
-        return None if self._known_gains is None else ad.Float([float(self._known_gains[view.index])] * 3)
+        return None if self._known_gains is None else upload_numbers([float(self._known_gains[view.index])] * 3)
 
     def learn(
         self,

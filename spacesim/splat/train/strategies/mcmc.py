@@ -12,7 +12,7 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, UInt64
-from spacesim.backend.upload import upload, upload_rows
+from spacesim.backend.upload import upload, upload_numbers, upload_rows
 from spacesim.data.errors import InputError, check_ranges
 from spacesim.data.structure import check_fields
 from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes, stack_rows
@@ -86,7 +86,7 @@ class McmcStrategy(Strategy):
             return
         factor = self.mcmc.noise * rate / self.scene_scale**2
         streams = np.random.SeedSequence([seed, 5, step]).generate_state(1, np.uint64)
-        values = ad.Float([factor, self.mcmc.min_opacity])
+        values = upload_numbers([factor, self.mcmc.min_opacity])
         gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, ad.UInt64(streams.tolist())))
 
     def refine(
