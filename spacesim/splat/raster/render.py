@@ -29,7 +29,7 @@ from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals,
 
 PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
 FEATURES_PER_PASS = 16  #: features in one pass: fewer repeat the blending, more gain little
-MANY_PIXELS, MANY_SPLATS = 2**19, 2**17  #: from which on a picture on CUDA takes longer than to ask for it
+MANY_PIXELS = 2**19  #: from which on a picture on CUDA takes longer than to ask for it
 
 
 @checked
@@ -124,7 +124,7 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
     expected = expected_capacity(extent)
     if expected is not None:
         listing = extent.live, held(expected, "pairs"), extent.capacities(expected), grid
-        if size[0] * size[1] >= MANY_PIXELS and count >= MANY_SPLATS and can_read_async():
+        if size[0] * size[1] >= MANY_PIXELS and can_read_async():
             listed = _list_splats(inputs, more, keeps_splats, *listing)
             number = AsyncNumber(listed.sums)
             planes = _blend_records(listed.records, listed.lists, counts, size, most)

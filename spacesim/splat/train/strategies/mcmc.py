@@ -85,9 +85,9 @@ class McmcStrategy(Strategy):
         if self.mcmc.noise == 0:
             return
         factor = self.mcmc.noise * rate / self.scene_scale**2
-        streams = np.random.SeedSequence([seed, 5, step]).generate_state(1, np.uint64)
+        stream = int(np.random.SeedSequence([seed, 5, step]).generate_state(1, np.uint64)[0])
         values = upload_numbers([factor, self.mcmc.min_opacity])
-        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, ad.UInt64(streams.tolist())))
+        gaussians.means = ad.Array3f(_jittered(gaussians.shape_rows(), values, dr.opaque(ad.UInt64, stream)))
 
     def refine(
         self, step: int, gaussians: Gaussians, optimizer: Adam, rng: np.random.Generator, leniency: float = 1.0
