@@ -51,15 +51,21 @@ def upload_numbers(values: Sequence[float]) -> Float:
     return ad.Float(list(values)) if functions is None else _outbox.send(values, functions)
 
 
-class _Outbox(threading.local):
-    """Memory of the host's from which a thread sends numbers, in two halves by turns: one is written again when all has
-    arrived that was sent from it."""
+class _Outbox:
+    """Memory of the host's from which numbers go to the device, in two halves by turns: one is written again when all
+    has arrived that was sent from it. Dr.Jit has one stream for all threads."""
 
     def __init__(self) -> None:
+        self._lock = threading.Lock()
         self._halves: list[tuple[HostSlot, np.ndarray]] = []
         self._sent = 0
 
     def send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
+        """Float [N] of at most `MOST` numbers. functions: `copy_functions`"""
+        with self._lock:
+            return self._send(values, functions)
+
+    def _send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
         array = dr.empty(ad.Float, len(values))
         dr.make_opaque(array)
         backend = dr.backend_v(array).value
