@@ -15,13 +15,15 @@ if TYPE_CHECKING:
         ArrayXf,
         Bool,
         Float,
+        Float64,
         Int32,
         TensorXf,
         UInt32,
         UInt64,
     )
 else:
-    Array2f = Array2u64 = Array3f = Array4f = ArrayXf = Bool = Float = Int32 = TensorXf = UInt32 = UInt64 = Any
+    Array2f = Array2u64 = Array3f = Array4f = ArrayXf = Bool = Any
+    Float = Float64 = Int32 = TensorXf = UInt32 = UInt64 = Any
 
 ArrayT = TypeVar("ArrayT", Float, Array3f)  #: the same type in and out
 NumberT = TypeVar("NumberT", Float, UInt32, Int32)  #: the same type in and out, of one dimension
@@ -35,6 +37,7 @@ __all__ = [
     "ArrayXf",
     "Bool",
     "Float",
+    "Float64",
     "Int32",
     "NumberT",
     "TensorXf",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Array3f, Array4f, Bool, Float
+from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, Float64
 from spacesim.backend.upload import upload_numbers
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
@@ -81,47 +81,47 @@ def fit_camera(
     shapes = gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logit_opacities
     means, log_scales, quaternions, logits = (batch.repeat_last(dr.detach(values)) for values in shapes)
     drawn = drawable_mask(means, log_scales, quaternions, logits) & batch.is_real()
-    near = _some_point(dr.detach(gaussians.means))
-    offset = dr.select(drawn, means - near, ad.Array3f(0))
     columns, scales = principal_axes(quaternions), dr.exp(dr.select(drawn, log_scales, ad.Array3f(0)))
-    counted = dr.select(drawn, ad.Float(1), 0)
+    # in double precision, sums about the world's origin are as good as about the mean, which took a pass of its own
+    places = [ad.Float64(dr.select(drawn, row, 0)) for row in means]
     axes = [_axis(light, i) for i in range(2)]
     ends, squares = [], []
     for axis in axes:
-        across = dr.dot(axis, offset)
+        across = _along(axis, places)
         spread2 = dr.squared_norm(ad.Array3f([dr.dot(axis, columns[k]) * scales[k] for k in range(3)]))  # 4.30
-        support = SUPPORT * dr.sqrt(spread2)  # 4.31
+        support = ad.Float64(SUPPORT * dr.sqrt(spread2))  # 4.31
         ends += [dr.select(drawn, end, MAX_MAGNITUDE) for end in (across - support, -across - support)]
-        squares.append(dr.select(drawn, dr.fma(across, across, spread2), 0))
-    added = [counted, *offset, *squares]
+        squares.append(dr.select(drawn, dr.fma(across, across, ad.Float64(spread2)), 0))
+    added = [ad.Float64(dr.select(drawn, ad.Float(1), 0)), *places, *squares]
     lowest_ends, (total, *sums) = _reduced(batch, (dr.ReduceOp.Min, ends), (dr.ReduceOp.Add, added))  # 4.32
-    share = dr.rcp(dr.maximum(total, 1))
-    shift = ad.Array3f([axis_sum * share for axis_sum in sums[:3]])
+    mean = [axis_sum / dr.maximum(total, 1) for axis_sum in sums[:3]]
+    middle = ad.Array3f([ad.Float(number) for number in mean])
     bounds = []
     for i, (axis, square) in enumerate(zip(axes, sums[3:], strict=True)):
-        mean = dr.dot(axis, shift)
-        lowest, highest = lowest_ends[2 * i] - mean, -lowest_ends[2 * i + 1] - mean
+        from_middle = _along(axis, [ad.Float64(number) for number in middle])
+        lowest, highest = ad.Float(lowest_ends[2 * i] - from_middle), ad.Float(-lowest_ends[2 * i + 1] - from_middle)
         if crop:
-            limit = REACH * dr.sqrt(dr.maximum(dr.fma(-mean, mean, square * share), 0))
+            along = _along(axis, mean)
+            variance = dr.fma(-along, along, square / dr.maximum(total, 1))
+            limit = REACH * dr.sqrt(ad.Float(dr.maximum(variance, 0)))
             lowest, highest = dr.maximum(lowest, -limit), dr.minimum(highest, limit)
         some = lowest < highest
         bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
-    middle = dr.select(total > 0, near + shift, ad.Array3f(0))
     return _camera(light, middle, bounds, size)
 
 
-def _some_point(means: Array3f) -> Array3f:
-    """Of width 1: a place among the Gaussians, about which sums do not cancel far from the world's origin."""
-    point = ad.Array3f([dr.gather(ad.Float, row, ad.UInt32(0)) for row in means])
-    return dr.select(dr.all(dr.abs(point) < MAX_MAGNITUDE), point, ad.Array3f(0))
+def _along(axis: Array3f, places: list[Float64]) -> Float64:
+    """Scalar product in double precision."""
+    x, y, z = (ad.Float64(number) * place for number, place in zip(axis, places, strict=True))
+    return x + y + z
 
 
-def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float]]) -> list[list[Float]]:
-    """Of each part (operation, rows [M]) its reduced rows, Floats of width 1. Rows lie one after another: a reduction
+def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float64]]) -> list[list[Float64]]:
+    """Of each part (operation, rows [M]) its reduced rows, of width 1. Rows lie one after another: a reduction
     is two launches, however many rows there are."""
     blocks, column = [], dr.arange(ad.UInt32, batch.capacity)
     for _, rows in parts:
-        numbers = dr.empty(ad.Float, len(rows) * batch.capacity)
+        numbers = dr.empty(ad.Float64, len(rows) * batch.capacity)
         for i, row in enumerate(rows):
             dr.scatter(numbers, row, column + i * batch.room, mode=dr.ReduceMode.NoConflicts)
         blocks.append(numbers)
@@ -129,7 +129,7 @@ def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float]]) -> lis
     for (op, rows), numbers in zip(parts, blocks, strict=True):
         of_blocks = dr.block_reduce(op, numbers, BLOCK)
         of_rows = dr.block_reduce(op, of_blocks, batch.capacity // BLOCK)
-        reduced.append([dr.gather(ad.Float, of_rows, ad.UInt32(i)) for i in range(len(rows))])
+        reduced.append([dr.gather(ad.Float64, of_rows, ad.UInt32(i)) for i in range(len(rows))])
     return reduced
 
 

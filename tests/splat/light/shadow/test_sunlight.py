@@ -61,6 +61,31 @@ def test_the_image_holds_the_supports(sun, crop):
     assert camera.world_from_camera[:3, :3] == pytest.approx(axes, abs=1e-6)
 
 
+@pytest.mark.parametrize("drawn", [True, False])
+@pytest.mark.parametrize("distance", [1e3, 1e5])
+def test_the_first_gaussian_may_be_a_stray(distance, drawn):
+    """No place among the Gaussians is special: the image is as the float64 reference has it."""
+    arrays = random_splats(500, seed=6)
+    arrays["means"][0] = [0.6 * distance, 0.8 * distance, 0]
+    if not drawn:
+        arrays["logit_opacities"][0] = -9.0
+    kept = arrays if drawn else {name: values[1:] for name, values in arrays.items()}
+    camera = camera_record(fit_camera(Gaussians.from_numpy(arrays), light_rows([0.3, -0.5, 0.8]), 64))
+    expected = np.ptp(reference_bounds(kept, light_axes([0.3, -0.5, 0.8]), REACH), axis=1)
+    found = (64 - 2 * MARGIN) / np.array([camera.scale_x, camera.scale_y])
+    assert found == pytest.approx(expected, rel=1e-4 if drawn else 1e-6)
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e4])
+def test_the_image_is_as_large_far_from_the_origin(distance):
+    arrays = random_splats(300, seed=7)
+    near = camera_record(fit_camera(Gaussians.from_numpy(arrays), light_rows([0.3, -0.5, 0.8]), 64))
+    arrays["means"] += np.float32([distance, -distance, distance])
+    far = camera_record(fit_camera(Gaussians.from_numpy(arrays), light_rows([0.3, -0.5, 0.8]), 64))
+    rounding = 1e-6 * distance
+    assert [far.scale_x, far.scale_y] == pytest.approx([near.scale_x, near.scale_y], rel=1e-4 + rounding)
+
+
 def test_a_stray_costs_no_resolution():
     arrays = random_splats(2000, seed=4)
     alone = camera_record(fit_camera(Gaussians.from_numpy(arrays), light_rows([0, 0, 1]), 64))
