@@ -179,6 +179,7 @@ def _picture_visibility(visibility: Float, faces: list[Float]) -> Float:
 
 
 def _refine_items(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf | None:
+    """Inputs of the refinement, TensorXf [B, C, m], where there is one."""
     return inputs.refine_items(config.refine, config.field.stored, batch) if config.refine else None
 
 
@@ -191,8 +192,9 @@ def _refine_occlusion(
 ) -> tuple[list[Float], network.MlpTape | None]:
     """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`"""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
-    if not config.refine or items is None:
+    if not config.refine:
         return occlusion, None
+    assert items is not None, "the refinement has inputs"
     (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
@@ -306,7 +308,7 @@ def _shares_of(inputs: ShadingInputs, visibility: list[Float]) -> _Shares:
 def _emitters_shares(
     config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visible: list[Float]
 ) -> _Shares:
-    """visible: of the batch, evaluated, in which emitters may be missing"""
+    """Of the Sun that each emitter sees. visible: of the batch, evaluated, in which emitters may be missing"""
     if batch.chosen is None or inputs.surroundings is None:
         return _shares_of(inputs, visible)
     emitters = Chosen(ad.UInt32(config.bounce), inputs.surroundings.emitters, None)

@@ -126,7 +126,8 @@ def surface_depth(gaussians: Gaussians, splats: Splats, index: UInt32, camera: P
 
 
 def depth_planes(gaussians: Gaussians, splats: Splats, camera: Projection, capacity: int) -> list[Float]:
-    """What `depth_on_planes` reads of each Gaussian."""
+    """Of each Gaussian what `depth_on_planes` reads, packets in arrays of `capacity`: centre on the screen (pixels),
+    slopes of depth (metres a pixel), depth and reach (metres)."""
     splats = dr.detach(splats)
     means, scales = dr.detach(gaussians.means), dr.detach(gaussians.log_scales)
     least = dr.minimum(scales[0], dr.minimum(scales[1], scales[2]))
@@ -147,7 +148,7 @@ def depth_planes(gaussians: Gaussians, splats: Splats, camera: Projection, capac
 
 
 def depth_on_planes(planes: list[Float], index: UInt32, camera: Projection, capacity: int) -> Float:
-    """`surface_depth` of `depth_planes`."""
+    """`surface_depth` by `depth_planes`."""
     is_hit = index != NONE
     x, y, slope_x, slope_y, depth, reach, *_ = load(planes, index, capacity, is_hit)
     pixel = dr.arange(ad.UInt32, camera.width * camera.height)

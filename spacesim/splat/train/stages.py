@@ -238,7 +238,8 @@ def picture_loss(
 
 
 NetworkStep = tuple[list[Float], tuple[list[Float], list[Float]], list[list[Float]], Float]
-"""What `update_light` takes."""
+"""What `update_light` takes: weights and embeddings, their first and second moments, gradients by them of each view,
+factors."""
 
 
 def update_light(

@@ -40,7 +40,7 @@ from spacesim.splat.train.optimizer.update import Update
 from spacesim.splat.train.pictures.learned import LearnedPictures
 from spacesim.splat.train.pictures.suns import FirstSuns
 from spacesim.splat.train.prior import MeshPrior
-from spacesim.splat.train.stages import NetworkStep, TargetImage, update_light
+from spacesim.splat.train.stages import NetworkStep, TargetImage
 from spacesim.splat.train.start import (
     initial_gaussians,
     largest_scale,
@@ -50,7 +50,6 @@ from spacesim.splat.train.start import (
     surface_normals,
 )
 from spacesim.splat.train.strategies.factory import make_strategy
-from spacesim.splat.train.strategies.strategy import OnScreen
 from spacesim.splat.train.view_pass import RenderedView, ViewLoss, ViewPass, ViewResult
 from spacesim.splat.train.views import TrainingView, TrainingViews
 from spacesim.splat.train.warm_start import Attraction, WarmStart
@@ -111,7 +110,7 @@ class Trainer(TrainingLoop):
             self._start_radius = float(np.linalg.norm(means - centre, axis=1)[is_near(means)].max())
         self.history, self.seconds = [], {"refinement": 0.0}
         self._view_pass = ViewPass(config, self.scene_scale)
-        self._update = Update(config.antialiased, self.scene_scale, config.surfels, self._learn_beside)
+        self._update = Update(config.antialiased, self.scene_scale, config.surfels, self.strategy.observe)
 
     @property
     def gaussian_count(self) -> int:
@@ -201,7 +200,7 @@ class Trainer(TrainingLoop):
                 drawn, loss, grad_splats, result = self._gradients(*asked)
         self.pictures.learn(self.iteration, view, rows, drawn, loss, grad_splats, self.scene_scale)
         if watched:
-            result.seen = view_pass.watched(drawn, grad_splats, number % self.config.views_per_step)
+            result.add_seen(view_pass.watched(drawn, grad_splats, number % self.config.views_per_step))
         if attraction:
             result.add_to_rows(self._add_attraction(rows, view, attraction))
         self.pictures.learn_sun(self.iteration, view, result.by_sun)
@@ -243,28 +242,21 @@ class Trainer(TrainingLoop):
         return TargetImage(rgba, background, valid, truth, self.pictures.gains(view))
 
     def _learn(self, degree: int, results: list[ViewResult]) -> None:
-        """Move the Gaussians and the networks, and tell the strategy what the views show. results: emptied"""
+        """Move the Gaussians and the networks; the strategy's state is what it is after these views."""
         gaussians, light, strategy, of_light = self.gaussians, self.light, self.strategy, self.light_optimizer
         weights = self.config.penalty_weights(self.scene_scale).items()
         penalties = {name: dr.opaque(ad.Float, weight / gaussians.count) for name, weight in weights}
         factors = upload_numbers([*self.optimizer.corrections(), *self.rates(self.iteration)])
         views = [result.take_gradients() for result in results]
-        seen = [result.seen for result in results if result.seen]
-        networks = [self._network_step(light, results)] if light else []
-        more, held = [strategy.observed_state() if seen else {}, seen, networks], self._held_now()
-        del seen, networks
-        results.clear()
-        state, moved = self._update(gaussians, self.optimizer, degree, views, factors, penalties, held, more)
+        watched = strategy.observed_state() if views[0].seen else None
+        networks, held = self._network_step(light, results) if light else None, self._held_now()
+        state, learned = self._update(
+            gaussians, self.optimizer, degree, views, factors, penalties, held, watched, networks
+        )
         strategy.state |= state
-        if light:
-            [(learned, of_light.first, of_light.second)] = moved
-            light.weights, light.embeddings = learned[: len(light.weights)], learned[len(light.weights) :]
-
-    def _learn_beside(
-        self, state: dict[str, Float], seen: list[OnScreen], networks: list[NetworkStep]
-    ) -> tuple[dict[str, Float], list[tuple[list[Float], list[Float], list[Float]]]]:
-        """(the strategy's state, what `update_light` gives of the networks)."""
-        return self.strategy.observe(state, seen) if seen else {}, [update_light(*step) for step in networks]
+        if light and learned:
+            moved, of_light.first, of_light.second = learned
+            light.weights, light.embeddings = moved[: len(light.weights)], moved[len(light.weights) :]
 
     def _held_now(self) -> list[Float]:
         """ln of `largest_scale` where the configuration holds sizes, once Gaussians may be split; else nothing."""

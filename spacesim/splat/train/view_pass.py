@@ -89,12 +89,16 @@ class ViewResult:
     loss: Float  #: Float of width 1
     by_networks: list[Float] = field(default_factory=list)  #: by their weights, then by the pictures' embeddings
     by_sun: Float | None = None  #: [3], by its direction, of pictures whose Suns are unknown
-    seen: OnScreen | None = None  #: where densification watches
 
     def add_to_rows(self, grad_rows: list[Float]) -> None:
         """Gradients of the Gaussians' first rows, Floats [N], that come from elsewhere."""
         assert self.gradients is not None, "gradients are read once"
         self.gradients.grad_rows = grad_rows
+
+    def add_seen(self, seen: OnScreen) -> None:
+        """What densification watches of the view."""
+        assert self.gradients is not None, "gradients are read once"
+        self.gradients.seen = seen
 
     def take_gradients(self) -> ViewGradients:
         """The gradients, which are not held any longer."""

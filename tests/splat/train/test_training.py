@@ -1,5 +1,6 @@
 """Training as a whole: it learns, it repeats to the bit, it survives interruption."""
 
+import gc
 import json
 import logging
 import math
@@ -7,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -544,6 +546,23 @@ def test_step_sizes_fall_as_the_configuration_says(small_lit_dataset, decay, sha
         trainer.iteration = index
         *_, factors = trainer._network_step(trainer.light, [ViewResult(None, ad.Float(0))])
         assert float(factors[2]) == pytest.approx(share * start.networks)
+
+
+@pytest.mark.parametrize("method", ["vanilla", "shadow-map"])
+def test_what_is_trained_goes_with_its_trainer(small_lit_dataset, method):
+    """Nothing refers back to a trainer: its arrays would stay until Python looks for cycles."""
+    trainer = Trainer(small_lit_dataset, replace(preset("demo", method), init_count=50))
+    for _ in range(3):
+        trainer.step()
+    of_trainer, of_gaussians = weakref.ref(trainer), weakref.ref(trainer.gaussians)
+    gc.collect()
+    gc.disable()
+    try:
+        del trainer
+        assert of_trainer() is None
+        assert of_gaussians() is None
+    finally:
+        gc.enable()
 
 
 def test_hidden_gaussians_have_no_colour(small_lit_dataset, monkeypatch):

@@ -1,4 +1,5 @@
-"""Adam steps of a model's parameters from what some views have taught of its splats, in parts.
+"""Adam steps of a model's parameters from what some views have taught of its splats, in parts; and what else a step
+changes, the networks of light and what densification watches.
 
 A part (`adam.parts`) is a few rows and a recorded function. The rows and moments that it replaces go at once: a
 step holds all of them once, and only those of a part twice (docs/research/memory.md). Many rows in one kernel were also
@@ -24,11 +25,13 @@ from spacesim.splat.raster.surface import flattened
 from spacesim.splat.train.loss.terms import penalty
 from spacesim.splat.train.optimizer.adam import OWN, Adam
 from spacesim.splat.train.optimizer.packing import PackedArray, load, store
-from spacesim.splat.train.stages import mean, shape_values
+from spacesim.splat.train.stages import NetworkStep, mean, shape_values, update_light
 
 AT_ONCE = 2**15  #: Gaussians with harmonics, at most, all of whose parts are one recorded function on CUDA
 FULL = 0.95  #: of the power of two to which Dr.Jit rounds rows, at least: all at once then take 1,530 bytes a Gaussian
 Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
+Learned = tuple[list[Float], list[Float], list[Float]]  #: of networks, see `update_light`
+Observe = Callable[[dict[str, Float], list[Any]], dict[str, Float]]  #: see `Strategy.observe`
 
 
 @dataclass
@@ -41,6 +44,7 @@ class ViewGradients:
     grad_values: dict[str, list[Float]]  #: by what was blended: {name: a Float [N] for each channel}
     grad_features: Float | None = None  #: [F * N], of a method of light
     grad_rows: list[Float] = field(default_factory=list)  #: of the first rows, beside what the splats give them
+    seen: Any = None  #: the view's `strategy.OnScreen` where densification watches, else None
 
 
 @dataclass
@@ -65,16 +69,14 @@ class Update:
     antialiased: whether splats are drawn with the anti-aliasing filter
     scale: metres, the unit of depth
     surfels: whether each step ends with discs, see `flattened`
-    beside: what else a step moves, of what `__call__` is given for it; a part of its recording where all is one
+    observe: `Strategy.observe` of the strategy that watches, if one does
     """
 
-    def __init__(
-        self, antialiased: bool, scale: float, surfels: bool = False, beside: Callable[..., Any] | None = None
-    ) -> None:
+    def __init__(self, antialiased: bool, scale: float, surfels: bool = False, observe: Observe | None = None) -> None:
         self.antialiased, self.scale, self.surfels = antialiased, scale, surfels
         self._own, self._features = recorded(_move_own), recorded(_move_features)
-        self._harmonics, self._all = recorded(_move_harmonics), recorded(self._move_all)
-        self._beside, self._beside_alone = beside, recorded(beside) if beside else None
+        self._harmonics, self._all = recorded(_move_harmonics), recorded(_step_of_all(observe))
+        self._beside = recorded(_step_beside(observe))
 
     def __call__(
         self,
@@ -85,18 +87,20 @@ class Update:
         factors: Float,
         penalties: Mapping[str, Float],
         largest: Sequence[Float] = (),
-        more: list[Any] | None = None,
-    ) -> Any:
-        """Replace the parameters and their moments. Returns what `beside` gives of `more`, its arguments, or None.
+        state: Mapping[str, Float] | None = None,
+        networks: NetworkStep | None = None,
+    ) -> tuple[dict[str, Float], Learned | None]:
+        """Replace the parameters and their moments. Returns (`state` after what the views show, or nothing where none
+        is watched; what `update_light` gives of the networks, or None).
 
-        views, more: emptied, so that gradients go once they are read
+        views: emptied, so that gradients go once they are read
         factors: Float [2 + R], Adam's two corrections and the step size of each row;  penalties: weights by name
         largest: ln of metres, no scale gets larger, a Float of width 1 in a list, or nothing
+        state: `Strategy.observed_state`;  networks: those of light
 
         Harmonics of no degree up to `degree` have never had a gradient: they stay as they are.
         """
         assert optimizer.count == gaussians.count, "moments of other Gaussians"
-        more = [] if more is None else more
         rows = [ad.Float(row) for row in gaussians.rows()]  # a row taken from an array keeps all of that array
         taught = _Taught(
             views=[(view.camera, view.grad_splats, view.grad_values, view.grad_rows) for view in views],
@@ -109,17 +113,17 @@ class Update:
             scale=self.scale,
             surfels=self.surfels,
         )
+        beside = [dict(state or {}), [view.seen for view in views if view.seen is not None], networks]
         views.clear()
         stops = [part.stop for part in optimizer.slices if part.start < OWN + 3 * (degree + 1) ** 2]
         if moves_at_once(gaussians):
             packed = list(zip(optimizer.arrays, optimizer.layouts, strict=True))[: len(stops)]
-            parts, features, others = self._all(rows, stops, packed, optimizer.features, taught, more)
-            more.clear()
+            parts, features, others = self._all(rows, stops, packed, optimizer.features, taught, tuple(beside))
             for number, (moved, moments) in enumerate(parts):
                 _replace(gaussians, optimizer, rows, number, moved, moments)
         else:
-            others = self._beside_alone(*more) if more and self._beside_alone else None
-            more.clear()
+            others = self._beside(*beside)
+            beside.clear()
             features = self._part_by_part(gaussians, optimizer, rows, stops, taught)
         if features:
             rows[-1], *optimizer.features = features
@@ -147,31 +151,6 @@ class Update:
             del packed, moved, moments
         return []
 
-    def _move_all(
-        self,
-        rows: list[Float],
-        stops: list[int],
-        packed: list[Packed],
-        of_features: list[Float],
-        taught: _Taught,
-        more: list[Any],
-    ) -> tuple[list[tuple[list[Float], list[Float]]], list[Float], Any]:
-        """(rows and moments of each part; the features and their moments, or nothing; of `beside`). stops: where parts
-        end;  of_features: their moments, or nothing"""
-        others = self._beside(*more) if more and self._beside else None
-        dr.schedule(others)
-        grad_sums, moved, moments = _move_own(rows, stops[0], packed[0], taught)
-        steps, factors = [(moved, moments)], taught.factors
-        if taught.grad_features:
-            return steps, _move_features(rows[-1], of_features, taught.grad_features, factors), others
-        cameras = [camera for camera, *_ in taught.views]
-        for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
-            first = (start - OWN) // 3
-            steps.append(
-                _move_harmonics(rows[start:stop], of_part, first, taught.degree, rows[:3], cameras, grad_sums, factors)
-            )
-        return steps, [], others
-
 
 def moves_at_once(gaussians: Gaussians) -> bool:
     """Whether all parts are one recorded function."""
@@ -189,6 +168,49 @@ def _replace(
         gaussians.replace(rows)
     else:
         gaussians.sh = ad.ArrayXf(rows[ROWS["sh"]])
+
+
+def _step_beside(observe: Observe | None) -> Callable[..., tuple[dict[str, Float], Learned | None]]:
+    """What a step changes beside Gaussians: a function of the strategy's state, what views show, and the networks."""
+
+    def step_beside(
+        state: dict[str, Float], seen: list[Any], networks: NetworkStep | None
+    ) -> tuple[dict[str, Float], Learned | None]:
+        state = observe(state, seen) if observe and seen else {}
+        return state, update_light(*networks) if networks else None
+
+    return step_beside
+
+
+def _step_of_all(observe: Observe | None) -> Callable[..., Any]:
+    """What a step changes, in one function."""
+    step_beside = _step_beside(observe)
+
+    def step_all(
+        rows: list[Float],
+        stops: list[int],
+        packed: list[Packed],
+        of_features: list[Float],
+        taught: _Taught,
+        beside: tuple[Any, ...],
+    ) -> tuple[list[tuple[list[Float], list[Float]]], list[Float], tuple[dict[str, Float], Learned | None]]:
+        """(rows and moments of each part; the features and their moments, or nothing; what stands beside). stops: where
+        parts end;  of_features: their moments, or nothing;  beside: what `step_beside` takes"""
+        others = step_beside(*beside)
+        dr.schedule(others)
+        grad_sums, moved, moments = _move_own(rows, stops[0], packed[0], taught)
+        steps, factors = [(moved, moments)], taught.factors
+        if taught.grad_features:
+            return steps, _move_features(rows[-1], of_features, taught.grad_features, factors), others
+        cameras = [camera for camera, *_ in taught.views]
+        for (start, stop), of_part in zip(pairwise(stops), packed[1:], strict=True):
+            first = (start - OWN) // 3
+            steps.append(
+                _move_harmonics(rows[start:stop], of_part, first, taught.degree, rows[:3], cameras, grad_sums, factors)
+            )
+        return steps, [], others
+
+    return step_all
 
 
 def _move_own(

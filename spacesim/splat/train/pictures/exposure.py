@@ -11,8 +11,8 @@ of 1.
 
 import numpy as np
 
-from spacesim.backend import ad
 from spacesim.backend.arrays import Float
+from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
 from spacesim.data.images.tone import exposure_value, tone_and_exposure
@@ -35,7 +35,7 @@ class Exposures:
 
     def gains(self, picture: int) -> Float:
         """Float [3] of a training picture."""
-        return ad.Float(np.exp(self.numbers.of(picture)).tolist())  # no numpy array: see `backend.recorded`
+        return upload_numbers(np.exp(self.numbers.of(picture)).tolist())  # no numpy array: see `backend.recorded`
 
     def all_gains(self) -> Array:
         """[V, 3] of all training pictures."""

@@ -53,7 +53,7 @@ class Strategy(ABC):
 
     @abstractmethod
     def observe(self, state: dict[str, Float], seen: list[OnScreen]) -> dict[str, Float]:
-        """`observed_state` after the views of a step. Recorded: it depends on nothing else."""
+        """`observed_state` after the views of a step. A part of recordings: it depends on nothing that changes."""
 
     @abstractmethod
     def refine(

@@ -92,6 +92,38 @@ def test_harmonics_of_higher_degrees_stay_as_they_are():
             np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_what_views_show_and_networks_move_with_the_gaussians(monkeypatch, at_once):
+    """A part of the step's recording or one of their own: the state by all views, weights by their mean gradient."""
+    monkeypatch.setattr(update_module, "moves_at_once", lambda _gaussians: at_once)
+
+    def observe(state, seen):
+        return {"sum": state["sum"] + sum(seen)}
+
+    gaussians, view = Gaussians.from_numpy(random_splats(50)), Pinhole.of(camera(0.8))
+    weights = [dr.ones(ad.Float, SIZE[0] * SIZE[1])] * 4
+    optimizer, update = Adam(gaussians.rows()), Update(False, 1.0, observe=observe)
+    factors, before = ad.Float([1.0, 1.0, *[0.1] * 59]), np.array(gaussians.means)
+    state, learned = (
+        {"sum": dr.opaque(ad.Float, 0, 50)},
+        ([ad.Float([3.0, 4.0])], [ad.Float([0, 0])], [ad.Float([0, 0])]),
+    )
+    for step in range(1, 4):
+        gradients = [view_gradients(gaussians, view, weights, 3) for _ in range(2)]
+        for k, one in enumerate(gradients):
+            one.seen = dr.opaque(ad.Float, 1.0 + k, 50)
+        moved, *moments = learned
+        networks = moved, tuple(moments), [[ad.Float([1.0, 0.0])], [ad.Float([3.0, 0.0])]], ad.Float([1.0, 1.0, 0.5])
+        state, learned = update(gaussians, optimizer, 3, gradients, factors, {}, (), state, networks)
+        assert not gradients
+        assert np.array(state["sum"]).tolist() == [3.0 * step] * 50
+        assert np.array(learned[1][0])[0] == pytest.approx(2 * (1 - BETA1**step))
+    assert (np.array(gaussians.means) != before).any()
+    assert np.array(learned[0][0])[0] < 3.0
+    assert np.array(learned[0][0])[1] == 4.0
+    assert update(gaussians, optimizer, 3, [view_gradients(gaussians, view, weights, 3)], factors, {}) == ({}, None)
+
+
 @pytest.mark.parametrize("name", ["isotropy", "opacity", "scale"])
 def test_a_step_does_not_depend_on_what_was_recorded(name):
     """Nor on how many Gaussians there were when it was: training goes on after a pause with the same bits."""
