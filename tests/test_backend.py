@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -595,27 +596,66 @@ def test_arrays_are_read_without_synchronising(monkeypatch, library):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Dr.Jit's library may have other names")
-def test_numbers_arrive_however_many_are_sent():
-    """Memory from which numbers go is written again and again, while earlier ones may be on their way."""
+def test_numbers_arrive_though_all_are_on_their_way():
+    """Memory from which numbers go is written again and again, here before a slow device has read the first."""
+    import drjit as dr
+
     from spacesim.backend import upload
     from spacesim.backend.readback import copy_functions
 
-    outbox, count, functions = upload._Outbox(), 3 * upload.TURNS + 7, copy_functions()
+    outbox, functions = upload._Outbox(), copy_functions()
     assert functions is not None
-    sent = [outbox.send([0.1 * k + n for n in range(1 + k % upload.MOST)], functions) for k in range(count)]
-    for k, array in enumerate(sent):
-        expected = [np.float32(0.1 * k + n) for n in range(1 + k % upload.MOST)]
-        np.testing.assert_array_equal(np.array(array), expected, err_msg=str(k))
+    lists = [[0.1 * k + n for n in range(1 + k % upload.MAX_NUMBERS)] for k in range(3 * upload.LISTS + 7)]
+    slow = dr.arange(backend.ad.Float, 2**22) + dr.opaque(backend.ad.Float, 0)
+    for _ in range(100):
+        slow = dr.sin(slow) + dr.cos(slow)
+    dr.eval(slow)
+    sent = [outbox.send(values, functions) for values in lists]
+    for values, array in zip(lists, sent, strict=True):
+        np.testing.assert_array_equal(np.array(array), np.float32(values))
+    for slot, _ in outbox._halves:
+        slot.event.wait()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Dr.Jit's library may have other names")
+def test_threads_send_numbers_from_the_same_memory():
+    from spacesim.backend import upload
+    from spacesim.backend.readback import copy_functions
+
+    outbox, functions = upload._Outbox(), copy_functions()
+
+    def send(thread: int) -> bool:
+        sent = [outbox.send([thread, k], functions) for k in range(upload.LISTS)]
+        return all(np.array(array).tolist() == [thread, k] for k, array in enumerate(sent))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(send, range(4)))
+    for slot, _ in outbox._halves:
+        slot.event.wait()
+
+
+@pytest.mark.parametrize("sends", [False, True])
 @pytest.mark.parametrize("count", [0, 1, 64, 65])
-def test_numbers_of_pythons_are_rounded_to_single_precision(count):
-    from spacesim.backend.upload import upload_numbers
+def test_numbers_of_pythons_are_rounded_to_single_precision(monkeypatch, count, sends):
+    from spacesim.backend import upload
 
+    if sends:
+        monkeypatch.setattr(upload, "select", lambda: "cuda")
     values = np.random.default_rng(count).normal(size=count)
-    found = upload_numbers(values.tolist())
+    values[3:4] = 1e300  # infinite
+    found = upload.upload_numbers(values.tolist())
     assert type(found) is backend.ad.Float
-    np.testing.assert_array_equal(np.array(found), values.astype(np.float32))
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(np.array(found), values.astype(np.float32))
+
+
+def test_numbers_go_by_dr_jit_where_its_library_lacks_the_functions(monkeypatch):
+    from spacesim.backend import upload
+
+    monkeypatch.setattr(upload, "select", lambda: "cuda")
+    monkeypatch.setattr(upload, "copy_functions", lambda: None)
+    monkeypatch.setattr(upload._outbox, "send", None)
+    assert np.array(upload.upload_numbers([2.0, 3.0])).tolist() == [2.0, 3.0]
 
 
 @pytest.mark.gpu

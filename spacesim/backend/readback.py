@@ -34,7 +34,7 @@ _FUNCTIONS_OF_CUDA: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "push": ("_Z21jit_cuda_push_contextPv", None, (c_void_p,)),
     "pop": ("_Z20jit_cuda_pop_contextv", c_void_p, ()),
 }
-LOCKED = 1  # memory that the host reads and the device writes; on CUDA its pages are locked: a copy to others waits
+LOCKED = 1  #: kind of memory for copies between host and device: on CUDA its pages are locked, or a copy would wait
 
 
 class AsyncNumber:
@@ -117,7 +117,7 @@ def can_read_async() -> bool:
 
 
 class HostSlot:
-    """Memory of the host's, and an event. Those for numbers are never given back: they are few, and used again."""
+    """Memory of the host's, and an event. Only what an array was read into is given back, the rest is used again."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -137,7 +137,7 @@ class HostSlot:
 
 
 class _FreeSlots(threading.local):
-    """For numbers, of a thread, whose stream the events belong to."""
+    """For numbers, of a thread."""
 
     def __init__(self) -> None:
         self.free: list[HostSlot] = []

@@ -3,9 +3,8 @@
 On LLVM, `ad.Float(values)` goes on reading numpy's own memory, and kernels read it in whole vectors, up to 60 bytes
 beyond its end: where the next page is not there, the process dies. What comes from numpy comes through here.
 
-On CUDA, Dr.Jit 1.5 gives the memory back from which it copied when the device says so: a call of the host's, for which
-all that the device was asked for since waits, on an H200 0.1 to 0.4 ms. What steps and pictures need comes through
-`upload_numbers`, whose memory stays.
+On CUDA, Dr.Jit 1.5 copies a list through locked memory and frees that in a host callback, which stalls the stream: on
+an H200 for 0.1 to 0.4 ms. Numbers that each step or picture has anew come through `upload_numbers`, which frees none.
 """
 
 import ctypes
@@ -22,8 +21,8 @@ from spacesim.backend.readback import LOCKED, HostSlot, copy_functions
 from spacesim.backend.selection import ad, select
 
 VECTOR = 64  # elements of the widest vector, and more
-MOST = 64  #: numbers that `upload_numbers` sends at once
-TURNS = 256  #: until all must have arrived that were sent from the other half of its memory
+MAX_NUMBERS = 64  #: of a list that `_Outbox` sends
+LISTS = 256  #: that it sends from half of its memory
 
 
 def upload(values: np.ndarray, kind: Any = None) -> Any:
@@ -44,16 +43,16 @@ def upload(values: np.ndarray, kind: Any = None) -> Any:
 
 
 def upload_numbers(values: Sequence[float]) -> Float:
-    """Float [N] of numbers of Python's. On CUDA few of them hold up nothing, where Dr.Jit's library has what it takes
-    (`copy_functions`)."""
-    sends = 0 < len(values) <= MOST and select() == "cuda" and not dr.flag(dr.JitFlag.FreezingScope)
+    """Float [N] of numbers of Python's, for arguments of recordings. On CUDA up to `MAX_NUMBERS` stall nothing, where
+    Dr.Jit's library has the functions (`copy_functions`)."""
+    sends = 0 < len(values) <= MAX_NUMBERS and select() == "cuda"
     functions = copy_functions() if sends else None
     return ad.Float(list(values)) if functions is None else _outbox.send(values, functions)
 
 
 class _Outbox:
-    """Memory of the host's from which numbers go to the device, in two halves by turns: one is written again when all
-    has arrived that was sent from it. Dr.Jit has one stream for all threads."""
+    """Locked memory of the host's from which lists of numbers go to the device, in two halves by turns: one is written
+    again when all has arrived that was sent from it. Dr.Jit 1.5 has one CUDA stream for all threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -61,7 +60,7 @@ class _Outbox:
         self._sent = 0
 
     def send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
-        """Float [N] of at most `MOST` numbers. functions: `copy_functions`"""
+        """Float [N] of at most `MAX_NUMBERS`. functions: `copy_functions`"""
         with self._lock:
             return self._send(values, functions)
 
@@ -70,25 +69,26 @@ class _Outbox:
         dr.make_opaque(array)
         backend = dr.backend_v(array).value
         if not self._halves:
-            self._halves = [_locked(functions["allocate"](backend, 4 * MOST * TURNS, LOCKED)) for _ in range(2)]
-        turn, place = divmod(self._sent, TURNS)
+            self._halves = [_locked(functions["allocate"](backend, 4 * MAX_NUMBERS * LISTS, LOCKED)) for _ in range(2)]
+        turn, place = divmod(self._sent, LISTS)
         slot, memory = self._halves[turn % 2]
         if place == 0 and turn >= 2:
             slot.event.wait()
-        first = MOST * place
-        memory[first : first + len(values)] = values
+        first = MAX_NUMBERS * place
+        with np.errstate(over="ignore"):  # infinite, as elsewhere
+            memory[first : first + len(values)] = values
         address = ctypes.c_void_p()
         variable = functions["address"](array.index, ctypes.byref(address))
         functions["copy"](backend, address, slot.address + 4 * first, 4 * len(values))
         functions["release"](variable)
         self._sent += 1
-        if place == TURNS - 1:
+        if place == LISTS - 1:
             slot.record(functions)
         return array
 
 
 def _locked(address: int) -> tuple[HostSlot, np.ndarray]:
-    memory: Any = (ctypes.c_float * (MOST * TURNS)).from_address(address)
+    memory: Any = (ctypes.c_float * (MAX_NUMBERS * LISTS)).from_address(address)
     return HostSlot(address), np.frombuffer(memory, np.float32)
 
 

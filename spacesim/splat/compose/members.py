@@ -14,7 +14,7 @@ import numpy as np
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
-from spacesim.backend.upload import upload
+from spacesim.backend.upload import upload, upload_numbers
 from spacesim.data.earth import Earth
 from spacesim.data.geometry import Array, robust_radius
 from spacesim.data.images.tone import Curve
@@ -195,7 +195,7 @@ class Ensemble:
             none = [ad.Float([]) for _ in range(11)]
             return Gaussians.from_rows(none)
         numbers = [[*p.rotation.ravel(), *p.translation, p.scale, np.log(p.scale), *p.quaternion] for p in poses]
-        table = ad.Float([float(number) for row in numbers for number in row])
+        table = upload_numbers([float(number) for row in numbers for number in row])
         return Gaussians.from_rows([*_placed(self.rows[:10], self.owner, table), self.rows[10]])
 
     def joined(self, parts: Sequence[Sequence[Float]]) -> list[Float]:
