@@ -90,7 +90,7 @@ def test_ctrl_c_or_sigterm_at_any_moment_is_one_sentence(tmp_path, moment, sente
 def test_ctrl_c_in_training_loses_no_step(tiny_data, tmp_path):
     """It comes amid the fourth step; the resumed run is the undisturbed one to the bit."""
     words = ["train", tiny_data, "--out", tmp_path / "run", *TRAIN]
-    done = run("-c", PRESSED, "call:_step_gaussians:4", *words, stdout=subprocess.PIPE)
+    done = run("-c", PRESSED, "call:_learn:4", *words, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr.splitlines(keepends=True)[-1]) == (130, RESUMABLE)
     assert [path.name for path in (tmp_path / "run" / "checkpoints").glob("*.safetensors")] == [
         "step_00000004.safetensors"
