@@ -83,10 +83,7 @@ class _Copy:
         else:
             self._slot = HostSlot(functions["allocate"](backend, max(self._bytes, _KEPT), LOCKED))
         self._is_pending = True
-        start = c_void_p()
-        variable = functions["address"](array.index, ctypes.byref(start))
-        functions["copy"](backend, self._slot.address, (start.value or 0) + size * first, self._bytes)
-        functions["release"](variable)
+        copy_entries(array, first, count, self._slot.address, functions, to_device=False)
         self._slot.record(functions)
 
     def wait(self) -> np.ndarray:
@@ -109,6 +106,17 @@ class _Copy:
         if getattr(self, "_is_pending", False):
             self._slot.event.wait()
             self._give_back()
+
+
+def copy_entries(array: Any, first: int, count: int, address: int, functions: dict[str, Any], to_device: bool) -> None:
+    """Ask the device for a copy of so many entries of an evaluated array, from the `first` on, to or from `LOCKED`
+    memory at an address. functions: `copy_functions`"""
+    dr, start = load_drjit(), c_void_p()
+    variable = functions["address"](array.index, ctypes.byref(start))
+    size = dr.itemsize_v(array)
+    places = address, (start.value or 0) + size * first
+    functions["copy"](dr.backend_v(array).value, *(places[::-1] if to_device else places), size * count)
+    functions["release"](variable)
 
 
 def can_read_async() -> bool:

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend.arrays import Array3f, Float, UInt32
-from spacesim.backend.readback import LOCKED, HostSlot, copy_functions
+from spacesim.backend.readback import LOCKED, HostSlot, copy_entries, copy_functions
 from spacesim.backend.selection import ad, select
 
 VECTOR = 64  # elements of the widest vector, and more
@@ -67,9 +67,9 @@ class _Outbox:
     def _send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
         array = dr.empty(ad.Float, len(values))
         dr.make_opaque(array)
-        backend = dr.backend_v(array).value
         if not self._halves:
-            self._halves = [_locked(functions["allocate"](backend, 4 * MAX_NUMBERS * LISTS, LOCKED)) for _ in range(2)]
+            kind, size = dr.backend_v(array).value, 4 * MAX_NUMBERS * LISTS
+            self._halves = [_locked(functions["allocate"](kind, size, LOCKED)) for _ in range(2)]
         turn, place = divmod(self._sent, LISTS)
         slot, memory = self._halves[turn % 2]
         if place == 0 and turn >= 2:
@@ -77,10 +77,7 @@ class _Outbox:
         first = MAX_NUMBERS * place
         with np.errstate(over="ignore"):  # infinite, as elsewhere
             memory[first : first + len(values)] = values
-        address = ctypes.c_void_p()
-        variable = functions["address"](array.index, ctypes.byref(address))
-        functions["copy"](backend, address, slot.address + 4 * first, 4 * len(values))
-        functions["release"](variable)
+        copy_entries(array, 0, len(values), slot.address + 4 * first, functions, to_device=True)
         self._sent += 1
         if place == LISTS - 1:
             slot.record(functions)

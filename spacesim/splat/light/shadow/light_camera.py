@@ -94,16 +94,15 @@ def fit_camera(
         squares.append(dr.select(drawn, dr.fma(across, across, ad.Float64(spread2)), 0))
     added = [ad.Float64(dr.select(drawn, ad.Float(1), 0)), *places, *squares]
     lowest_ends, (total, *sums) = _reduced(batch, (dr.ReduceOp.Min, ends), (dr.ReduceOp.Add, added))  # 4.32
-    mean = [axis_sum / dr.maximum(total, 1) for axis_sum in sums[:3]]
+    *mean, x_square, y_square = (of_all / dr.maximum(total, 1) for of_all in sums)
     middle = ad.Array3f([ad.Float(number) for number in mean])
     bounds = []
-    for i, (axis, square) in enumerate(zip(axes, sums[3:], strict=True)):
+    for i, (axis, square) in enumerate(zip(axes, (x_square, y_square), strict=True)):
         from_middle = _along(axis, [ad.Float64(number) for number in middle])
         lowest, highest = ad.Float(lowest_ends[2 * i] - from_middle), ad.Float(-lowest_ends[2 * i + 1] - from_middle)
         if crop:
             along = _along(axis, mean)
-            variance = dr.fma(-along, along, square / dr.maximum(total, 1))
-            limit = REACH * dr.sqrt(ad.Float(dr.maximum(variance, 0)))
+            limit = REACH * dr.sqrt(ad.Float(dr.maximum(dr.fma(-along, along, square), 0)))
             lowest, highest = dr.maximum(lowest, -limit), dr.minimum(highest, limit)
         some = lowest < highest
         bounds.append((dr.select(some, lowest, -0.5), dr.select(some, highest, 0.5)))
