@@ -2,12 +2,12 @@
 
 To read an array synchronises with the device. Here the device copies it, or an entry, to memory of the host's as soon
 as it is there, and an event says when. Dr.Jit has the events for Python, the copy in C++ alone: `can_read_async` says
-whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS.
+whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS. That memory is kept: Dr.Jit 1.5 gives it
+back in a host callback, which stalls the stream.
 """
 
 import ctypes
 import importlib
-import threading
 from ctypes import c_int, c_size_t, c_uint32, c_void_p
 from functools import cache
 from pathlib import Path
@@ -18,12 +18,11 @@ import numpy as np
 from spacesim.backend.arrays import Float, UInt32, UInt64
 from spacesim.backend.selection import load_drjit, select
 
+SMALLEST = 64  #: bytes of the memory for a copy
 MAX_BYTES = 2**26  #: of an array that is copied on its own: such memory of the host's is scarce
-_KEPT = 8  # bytes of the host's for a number
 _LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
 _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
-    "free": ("_Z8jit_freePv", None, (c_void_p,)),
     "copy": ("_Z16jit_memcpy_async10JitBackendPvPKvm", None, (c_uint32, c_void_p, c_void_p, c_size_t)),
     "address": ("_Z12jit_var_datajPPv", c_uint32, (c_uint32, c_void_p)),
     "release": ("_Z20jit_var_dec_ref_implj", None, (c_uint32,)),
@@ -38,7 +37,7 @@ LOCKED = 1  #: kind of memory for copies between host and device: on CUDA its pa
 
 
 class AsyncNumber:
-    """The last entry of an evaluated array UInt32 or UInt64 [N], read once with `wait`, by the thread that made it."""
+    """The last entry of an evaluated array UInt32 or UInt64 [N], read once with `wait`."""
 
     def __init__(self, array: UInt32 | UInt64) -> None:
         """Raises RuntimeError where `can_read_async` is false."""
@@ -50,8 +49,8 @@ class AsyncNumber:
 
 
 class AsyncArray:
-    """An array Float or UInt32 [N], read once with `wait`, by the thread that made it. Where `can_read_async` is false,
-    or the array takes more than `MAX_BYTES`, that waits for all that the device was asked for."""
+    """An array Float or UInt32 [N], read once with `wait`. That waits for all that the device was asked for where
+    `can_read_async` is false, or the array takes more than `MAX_BYTES`."""
 
     def __init__(self, array: Float | UInt32) -> None:
         load_drjit().eval(array)
@@ -76,12 +75,13 @@ class _Copy:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
         dr = load_drjit()
         backend, size = dr.backend_v(array).value, dr.itemsize_v(array)
-        self._type, self._bytes = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), size * count
-        self._free = functions["free"] if self._bytes > _KEPT else None
-        if self._free is None and _local.free:
-            self._slot = _local.free.pop()
-        else:
-            self._slot = HostSlot(functions["allocate"](backend, max(self._bytes, _KEPT), LOCKED))
+        self._type, self._count = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), count
+        room = max(SMALLEST, 1 << (size * count - 1).bit_length())
+        self._free = _slots.setdefault(room, [])
+        try:
+            self._slot = self._free.pop()
+        except IndexError:
+            self._slot = HostSlot(functions["allocate"](backend, room, LOCKED))
         self._is_pending = True
         copy_entries(array, first, count, self._slot.address, functions, to_device=False)
         self._slot.record(functions)
@@ -89,7 +89,7 @@ class _Copy:
     def wait(self) -> np.ndarray:
         """[count], once."""
         self._slot.event.wait()
-        memory: Any = (ctypes.c_char * self._bytes).from_address(self._slot.address)
+        memory: Any = (ctypes.c_char * (self._count * self._type.itemsize)).from_address(self._slot.address)
         entries: np.ndarray = np.frombuffer(memory, self._type).copy()
         self._give_back()
         return entries
@@ -97,10 +97,7 @@ class _Copy:
     def _give_back(self) -> None:
         """The memory, once the device has written into it."""
         self._is_pending = False
-        if self._free is None:
-            _local.free.append(self._slot)
-        else:
-            self._free(self._slot.address)
+        self._free.append(self._slot)
 
     def __del__(self) -> None:
         if getattr(self, "_is_pending", False):
@@ -125,7 +122,7 @@ def can_read_async() -> bool:
 
 
 class HostSlot:
-    """Memory of the host's, and an event. Only what an array was read into is given back, the rest is used again."""
+    """Memory of the host's that is used again and again, and an event."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -144,14 +141,9 @@ class HostSlot:
             functions["pop"]()
 
 
-class _FreeSlots(threading.local):
-    """For numbers, of a thread."""
-
-    def __init__(self) -> None:
-        self.free: list[HostSlot] = []
-
-
-_local = _FreeSlots()
+_slots: dict[int, list[HostSlot]] = {}
+"""Into which nothing is copied now, by their bytes, powers of two. Threads take and append without a lock, for a copy
+may be let go at any moment."""
 
 
 @cache
