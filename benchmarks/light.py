@@ -30,7 +30,8 @@ from spacesim.splat.train.config import METHODS, preset
 
 LIT = METHODS[1:]
 DIRECTION = 4, 1, 1  #: of the camera from the sphere
-SUNS = fibonacci_sphere(64)
+SUNS = fibonacci_sphere(64)  #: of training steps
+NEW_SUNS = np.random.default_rng(1).permutation(fibonacci_sphere(4096))  #: of frames: what is made of a Sun is kept
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "10000x256,30000x256"}
 STEPS = {"cuda": "100000x512", "llvm": "10000x128"}
 THESIS = {31622: 108, 101958: 77, 165495: 70}  #: frames per second (section 4.3.6, shadow mapping)
@@ -56,7 +57,7 @@ class Frame:
 
     def sun(self) -> np.ndarray:
         self.calls += 1
-        return np.asarray(SUNS[self.calls % len(SUNS)])
+        return np.asarray(NEW_SUNS[self.calls % len(NEW_SUNS)])
 
     def shadows(self) -> None:
         dr.eval(self.light.shadows(self.gaussians, self.sun()))

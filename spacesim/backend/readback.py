@@ -41,7 +41,7 @@ class AsyncNumber:
 
     def __init__(self, array: UInt32 | UInt64) -> None:
         """Raises RuntimeError where `can_read_async` is false."""
-        self._copy = _Copy(array, load_drjit().width(array) - 1, 1)
+        self._copy = _Copy(array, len(array) - 1, 1)
 
     def wait(self) -> int:
         """The number. Waits for what was asked of the device before this was made, and for nothing else."""
@@ -54,7 +54,7 @@ class AsyncArray:
 
     def __init__(self, array: Float | UInt32) -> None:
         load_drjit().eval(array)
-        count = load_drjit().width(array)
+        count = len(array)
         copies = can_read_async() and 0 < 4 * count <= MAX_BYTES
         self._array, self._copy = None if copies else array, _Copy(array, 0, count) if copies else None
 
@@ -73,10 +73,9 @@ class _Copy:
         functions = copy_functions()
         if functions is None:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
-        dr = load_drjit()
-        backend, size = dr.backend_v(array).value, dr.itemsize_v(array)
-        self._type, self._count = np.dtype("f4" if dr.is_float_v(array) else f"u{size}"), count
-        room = max(SMALLEST, 1 << (size * count - 1).bit_length())
+        backend, self._type = _kind(array.__class__)
+        self._bytes = count * self._type.itemsize
+        room = max(SMALLEST, 1 << (self._bytes - 1).bit_length())
         self._free = _slots.setdefault(room, [])
         try:
             self._slot = self._free.pop()
@@ -89,7 +88,7 @@ class _Copy:
     def wait(self) -> np.ndarray:
         """[count], once."""
         self._slot.event.wait()
-        memory: Any = (ctypes.c_char * (self._count * self._type.itemsize)).from_address(self._slot.address)
+        memory: Any = (ctypes.c_char * self._bytes).from_address(self._slot.address)
         entries: np.ndarray = np.frombuffer(memory, self._type).copy()
         self._give_back()
         return entries
@@ -108,12 +107,18 @@ class _Copy:
 def copy_entries(array: Any, first: int, count: int, address: int, functions: dict[str, Any], to_device: bool) -> None:
     """Ask the device for a copy of so many entries of an evaluated array, from the `first` on, to or from `LOCKED`
     memory at an address. functions: `copy_functions`"""
-    dr, start = load_drjit(), c_void_p()
+    start, (backend, dtype) = c_void_p(), _kind(array.__class__)
     variable = functions["address"](array.index, ctypes.byref(start))
-    size = dr.itemsize_v(array)
-    places = address, (start.value or 0) + size * first
-    functions["copy"](dr.backend_v(array).value, *(places[::-1] if to_device else places), size * count)
+    place, size = (start.value or 0) + dtype.itemsize * first, dtype.itemsize * count
+    functions["copy"](backend, *((place, address) if to_device else (address, place)), size)
     functions["release"](variable)
+
+
+@cache
+def _kind(array: type) -> tuple[int, np.dtype]:
+    """(backend, entries) of a type of arrays, as Dr.Jit's library and numpy say."""
+    dr = load_drjit()
+    return dr.backend_v(array).value, np.dtype("f4" if dr.is_float_v(array) else f"u{dr.itemsize_v(array)}")
 
 
 def can_read_async() -> bool:

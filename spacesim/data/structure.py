@@ -148,14 +148,18 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     names = list(signature(function).parameters)
 
     @cache
-    def hints() -> dict[str, Any]:
-        return {name: hint for name, hint in get_type_hints(function).items() if _is_checked(hint)}
+    def hints() -> list[tuple[int, str, Any]]:
+        """(place, name, annotation) of each argument that is looked at."""
+        found = get_type_hints(function)
+        return [(i, name, found[name]) for i, name in enumerate(names) if name in found and _is_checked(found[name])]
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        for name, value in [*zip(names, args, strict=False), *kwargs.items()]:
-            if name in hints():
-                _python_value(hints()[name], name, value)
+        for place, name, hint in hints():
+            if place < len(args):
+                _python_value(hint, name, args[place])
+            elif name in kwargs:
+                _python_value(hint, name, kwargs[name])
         return function(*args, **kwargs)
 
     return call

@@ -20,9 +20,10 @@ VIEWS, TESTS, SIZE = 8, 2, 32
 
 
 @pytest.fixture(autouse=True)
-def forget_free_memory():
-    """Of the test before."""
+def forget_the_test_before():
+    """What it found free of memory, and the tiles of its pictures: some tests have other tiles."""
     capacity._found.clear()
+    capacity.Extent.of.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import drjit as dr
 
-from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import check_ranges
@@ -37,6 +36,16 @@ class Encoding:
 
     def __call__(self, vectors: Array3f) -> list[Float]:
         """`size` Floats [N] of vectors [3, N]."""
+        return self._terms(vectors)
+
+    def of_one(self, vector: Sequence[float] | Array) -> Float:
+        """Float [size] of one vector, three numbers, by the host. They are no constants of a kernel: others compile
+        nothing."""
+        point = dr.scalar.Array3f64([float(number) for number in vector])
+        return upload_numbers([float(term) for term in self._terms(point)])
+
+    def _terms(self, vectors: Any) -> list[Any]:
+        """Of an array of vectors of any type, or of one vector."""
         if self.kind == "harmonics":
             return list(dr.sh_eval(vectors, self.degree))
         terms = list(vectors)
@@ -44,9 +53,3 @@ class Encoding:
             for value in vectors:
                 terms += dr.sincos(value * (2**k * dr.pi))
         return terms
-
-    def of_one(self, vector: Sequence[float] | Array) -> Float:
-        """Float [size] of one vector, three numbers. They are no constants of a kernel: others compile nothing."""
-        numbers = upload_numbers([float(number) for number in vector])  # no numpy array: see `backend.recorded`
-        point = ad.Array3f([dr.gather(ad.Float, numbers, ad.UInt32(i)) for i in range(3)])
-        return dr.concat([ad.Float(term) for term in self(point)])

@@ -3,7 +3,7 @@
 What a picture shows beside colour is blended as features of the Gaussians: `blend` takes any number of them.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -50,11 +50,13 @@ def render(
     antialiased: see `project`
     Raises ValueError for another output or degree, or features of another length.
     """
-    alone = isinstance(outputs, str) or not isinstance(outputs, Iterable)
-    unknown = [outputs] if alone else [name for name in outputs if name not in OUTPUTS]
+    try:
+        unknown: list[object] = [outputs] if isinstance(outputs, str) else [n for n in outputs if n not in OUTPUTS]
+    except TypeError:
+        unknown = [outputs]
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
-    if not isinstance(antialiased, bool | dr.ArrayBase):
+    if not isinstance(antialiased, (bool, dr.ArrayBase)):
         raise ValueError(f"antialiased: expected true or false, found {antialiased!r}")
     try:
         feature_list = [] if features is None else [ad.Float(feature) for feature in features]
@@ -118,7 +120,7 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
     between two recordings. more: blended beside the outputs"""
     rows, camera, *_ = inputs
     size, count = (camera.width, camera.height), dr.width(rows[0])
-    extent = Extent(count, *size, few_sizes=True)
+    extent = Extent.of(count, *size, few_sizes=True)
     grid, most = extent.grid, extent.most
     counts = tuple((name, PLANES[name]) for name in PLANES if name in inputs[3]) + _counts(more)
     expected = expected_capacity(extent)

@@ -148,7 +148,7 @@ class ViewPass:
         see `RenderedView`;  watched: whether densification wants to know of it"""
         self.pairs.pending.clear()  # of a step that was interrupted
         camera, pairs = self._camera(view.camera, downscale), self.pairs.of_view("picture", view.index)
-        extent = Extent(gaussians.count, camera.width, camera.height, training=True)
+        extent = Extent.of(gaussians.count, camera.width, camera.height, training=True)
         config, grid = self.config, extent.grid
         asked = ViewRequest(
             rows, camera, degree, config.antialiased, config.shape_terms, self.scale, watched, extent.live

@@ -125,7 +125,7 @@ def cast_shadows(
         config.grazing,
     )
     splats = gaussians.count if isinstance(config.method, MappingConfig) else 2 * sunlit.batch.capacity
-    extent = Extent(splats, config.size, config.size)
+    extent = Extent.of(splats, config.size, config.size)
     expected = pairs.expected(extent)
     if expected is not None:
         limit, capacities = held(expected, "pairs"), extent.capacities(expected)

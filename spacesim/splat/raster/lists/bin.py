@@ -37,7 +37,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, 
 
     Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
     """
-    extent = Extent(dr.width(splats.x), width, height, few_sizes)
+    extent = Extent.of(dr.width(splats.x), width, height, few_sizes)
     if extent.count == 0:
         return lists_of_boxes(footprints, None, extent, 0)
     boxes = make_boxes(_detached(splats), footprints, extent.live, extent.most, extent.grid)
