@@ -135,7 +135,7 @@ class LightModel:
         if config is None:
             return None
         assert sun is not None, "shadows need the Sun"
-        return cast_shadows(gaussians, self.encode_sun(sun).light_axes, config, self.frame.distance, pairs)
+        return cast_shadows(gaussians, light_rows(sun), config, self.frame.distance, pairs)
 
     def shade(
         self,
