@@ -31,7 +31,7 @@ from spacesim.splat.train.config import METHODS, preset
 LIT = METHODS[1:]
 DIRECTION = 4, 1, 1  #: of the camera from the sphere
 SUNS = fibonacci_sphere(64)  #: of training steps
-NEW_SUNS = np.random.default_rng(1).permutation(fibonacci_sphere(4096))  #: of frames: what is made of a Sun is kept
+NEW_SUNS = iter(np.random.default_rng(1).permutation(fibonacci_sphere(2**16)))  #: of frames: what one needs is kept
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "10000x256,30000x256"}
 STEPS = {"cuda": "100000x512", "llvm": "10000x128"}
 THESIS = {31622: 108, 101958: 77, 165495: 70}  #: frames per second (section 4.3.6, shadow mapping)
@@ -53,21 +53,16 @@ class Frame:
         self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), 0)
         self.camera = Pinhole.of(common.camera_from(DIRECTION, pixels))
         dr.eval(self.gaussians.rows(), self.camera.values)
-        self.calls = 0
-
-    def sun(self) -> np.ndarray:
-        self.calls += 1
-        return np.asarray(NEW_SUNS[self.calls % len(NEW_SUNS)])
 
     def shadows(self) -> None:
-        dr.eval(self.light.shadows(self.gaussians, self.sun()))
+        dr.eval(self.light.shadows(self.gaussians, next(NEW_SUNS)))
 
     def shade(self) -> None:
         """Shadows and field."""
-        dr.eval(self.light.shade_picture(self.gaussians, self.camera, self.sun()))
+        dr.eval(self.light.shade_picture(self.gaussians, self.camera, next(NEW_SUNS)))
 
     def frame(self) -> None:
-        output = draw_lit(self.gaussians, self.light, self.camera, self.sun())
+        output = draw_lit(self.gaussians, self.light, self.camera, next(NEW_SUNS))
         dr.eval(output.features, output.alpha)
 
 

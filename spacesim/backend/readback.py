@@ -2,8 +2,7 @@
 
 To read an array synchronises with the device. Here the device copies it, or an entry, to memory of the host's as soon
 as it is there, and an event says when. Dr.Jit has the events for Python, the copy in C++ alone: `can_read_async` says
-whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS. That memory is kept: Dr.Jit 1.5 gives it
-back in a host callback, which stalls the stream.
+whether its library has that by the names of Dr.Jit 1.5 on Linux and macOS.
 """
 
 import ctypes
@@ -18,11 +17,12 @@ import numpy as np
 from spacesim.backend.arrays import Float, UInt32, UInt64
 from spacesim.backend.selection import load_drjit, select
 
-SMALLEST = 64  #: bytes of the memory for a copy
+SLOT = 64  #: bytes of memory for a copy that is used again: to give it back stalls the device's stream
 MAX_BYTES = 2**26  #: of an array that is copied on its own: such memory of the host's is scarce
 _LIBRARIES = "libdrjit-core.so", "libdrjit-core.dylib"
 _FUNCTIONS: dict[str, tuple[str, Any, tuple[Any, ...]]] = {
     "allocate": ("_Z10jit_malloc10JitBackendmi", c_void_p, (c_uint32, c_size_t, c_int)),
+    "free": ("_Z8jit_freePv", None, (c_void_p,)),
     "copy": ("_Z16jit_memcpy_async10JitBackendPvPKvm", None, (c_uint32, c_void_p, c_void_p, c_size_t)),
     "address": ("_Z12jit_var_datajPPv", c_uint32, (c_uint32, c_void_p)),
     "release": ("_Z20jit_var_dec_ref_implj", None, (c_uint32,)),
@@ -49,7 +49,7 @@ class AsyncNumber:
 
 
 class AsyncArray:
-    """An array Float or UInt32 [N], read once with `wait`. That waits for all that the device was asked for where
+    """An array Float or UInt32 [N], read once with `wait`, which waits for all that the device was asked for where
     `can_read_async` is false, or the array takes more than `MAX_BYTES`."""
 
     def __init__(self, array: Float | UInt32) -> None:
@@ -73,20 +73,20 @@ class _Copy:
         functions = copy_functions()
         if functions is None:
             raise RuntimeError("this Dr.Jit does not copy numbers to the host while the device goes on")
-        backend, self._type = _kind(array.__class__)
+        backend, self._type = _layout(array.__class__)
         self._bytes = count * self._type.itemsize
-        room = max(SMALLEST, 1 << (self._bytes - 1).bit_length())
-        self._free = _slots.setdefault(room, [])
-        try:
-            self._slot = self._free.pop()
-        except IndexError:
-            self._slot = HostSlot(functions["allocate"](backend, room, LOCKED))
-        self._is_pending = True
+        self._free = functions["free"] if self._bytes > SLOT else None
+        if self._free is None and _slots:
+            self._slot = _slots.pop()
+        else:
+            self._slot = HostSlot(functions["allocate"](backend, max(self._bytes, SLOT), LOCKED))
         copy_entries(array, first, count, self._slot.address, functions, to_device=False)
         self._slot.record(functions)
+        self._is_pending = True
 
     def wait(self) -> np.ndarray:
         """[count], once."""
+        assert self._is_pending, "read once"
         self._slot.event.wait()
         memory: Any = (ctypes.c_char * self._bytes).from_address(self._slot.address)
         entries: np.ndarray = np.frombuffer(memory, self._type).copy()
@@ -96,7 +96,10 @@ class _Copy:
     def _give_back(self) -> None:
         """The memory, once the device has written into it."""
         self._is_pending = False
-        self._free.append(self._slot)
+        if self._free is None:
+            _slots.append(self._slot)
+        else:
+            self._free(self._slot.address)
 
     def __del__(self) -> None:
         if getattr(self, "_is_pending", False):
@@ -107,7 +110,7 @@ class _Copy:
 def copy_entries(array: Any, first: int, count: int, address: int, functions: dict[str, Any], to_device: bool) -> None:
     """Ask the device for a copy of so many entries of an evaluated array, from the `first` on, to or from `LOCKED`
     memory at an address. functions: `copy_functions`"""
-    start, (backend, dtype) = c_void_p(), _kind(array.__class__)
+    start, (backend, dtype) = c_void_p(), _layout(array.__class__)
     variable = functions["address"](array.index, ctypes.byref(start))
     place, size = (start.value or 0) + dtype.itemsize * first, dtype.itemsize * count
     functions["copy"](backend, *((place, address) if to_device else (address, place)), size)
@@ -115,8 +118,8 @@ def copy_entries(array: Any, first: int, count: int, address: int, functions: di
 
 
 @cache
-def _kind(array: type) -> tuple[int, np.dtype]:
-    """(backend, entries) of a type of arrays, as Dr.Jit's library and numpy say."""
+def _layout(array: type) -> tuple[int, np.dtype]:
+    """(number of the backend, type of the entries) of a type of arrays."""
     dr = load_drjit()
     return dr.backend_v(array).value, np.dtype("f4" if dr.is_float_v(array) else f"u{dr.itemsize_v(array)}")
 
@@ -127,7 +130,7 @@ def can_read_async() -> bool:
 
 
 class HostSlot:
-    """Memory of the host's that is used again and again, and an event."""
+    """Memory of the host's, and an event."""
 
     def __init__(self, address: int) -> None:
         self.address = address
@@ -146,9 +149,7 @@ class HostSlot:
             functions["pop"]()
 
 
-_slots: dict[int, list[HostSlot]] = {}
-"""Into which nothing is copied now, by their bytes, powers of two. Threads take and append without a lock, for a copy
-may be let go at any moment."""
+_slots: list[HostSlot] = []  # of `SLOT` bytes, free; taken and given back without a lock: `__del__` comes at any moment
 
 
 @cache

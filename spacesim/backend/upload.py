@@ -21,7 +21,7 @@ from spacesim.backend.readback import LOCKED, HostSlot, copy_entries, copy_funct
 from spacesim.backend.selection import ad, select
 
 VECTOR = 64  # elements of the widest vector, and more
-MAX_NUMBERS = 64  #: of a list that `_Outbox` sends
+MAX_NUMBERS = 128  #: of a list that `_Outbox` sends
 LISTS = 256  #: that it sends from half of its memory
 
 

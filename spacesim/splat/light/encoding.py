@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import drjit as dr
 
-from spacesim.backend.arrays import Array3f, Float
+from spacesim.backend.arrays import Float
 from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import check_ranges
 from spacesim.data.geometry import Array
@@ -34,18 +34,8 @@ class Encoding:
         """How many numbers."""
         return (self.degree + 1) ** 2 if self.kind == "harmonics" else 3 + 6 * self.degree
 
-    def __call__(self, vectors: Array3f) -> list[Float]:
-        """`size` Floats [N] of vectors [3, N]."""
-        return self._terms(vectors)
-
-    def of_one(self, vector: Sequence[float] | Array) -> Float:
-        """Float [size] of one vector, three numbers, by the host. They are no constants of a kernel: others compile
-        nothing."""
-        point = dr.scalar.Array3f64([float(number) for number in vector])
-        return upload_numbers([float(term) for term in self._terms(point)])
-
-    def _terms(self, vectors: Any) -> list[Any]:
-        """Of an array of vectors of any type, or of one vector."""
+    def __call__(self, vectors: Any) -> list[Any]:
+        """`size` Floats [N] of vectors, Array3f [3, N], or numbers of one vector, Dr.Jit's scalar Array3f64."""
         if self.kind == "harmonics":
             return list(dr.sh_eval(vectors, self.degree))
         terms = list(vectors)
@@ -53,3 +43,9 @@ class Encoding:
             for value in vectors:
                 terms += dr.sincos(value * (2**k * dr.pi))
         return terms
+
+    def of_one(self, vector: Sequence[float] | Array) -> Float:
+        """Float [size] of one vector, three numbers, by the host. They are no constants of a kernel: others compile
+        nothing."""
+        point = dr.scalar.Array3f64([float(number) for number in vector])
+        return upload_numbers([float(term) for term in self(point)])

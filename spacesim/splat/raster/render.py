@@ -56,7 +56,7 @@ def render(
         unknown = [outputs]
     if unknown:
         raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
-    if not isinstance(antialiased, (bool, dr.ArrayBase)):
+    if not isinstance(antialiased, bool | dr.ArrayBase):
         raise ValueError(f"antialiased: expected true or false, found {antialiased!r}")
     try:
         feature_list = [] if features is None else [ad.Float(feature) for feature in features]

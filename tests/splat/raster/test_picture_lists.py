@@ -176,3 +176,9 @@ def test_a_backend_whose_host_computes_waits(monkeypatch):
     observe(EXTENT, 100_000)
     monkeypatch.setattr(picture_lists, "BACKENDS", ())
     assert expected_capacity(EXTENT) is None
+
+
+def test_extents_of_equal_numbers_are_not_mixed_up():
+    assert isinstance(Extent.of(7, 32.0, 32.0).grid.columns, float)
+    assert isinstance(Extent.of(7, 32, 32).grid.columns, int)
+    assert Extent.of(7, 32, 32) is Extent.of(7, 32, 32)

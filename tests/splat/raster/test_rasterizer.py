@@ -394,6 +394,7 @@ def test_pictures_of_many_pixels_have_larger_tiles_on_cuda(monkeypatch):
     take_cudas(monkeypatch)
     for small in (2**18, 0):
         monkeypatch.setattr(tiles, "SMALL", small)
+        capacity.Extent.of.cache_clear()
         drawn.append(picture(arrays, view))
         found.append(adjoints(arrays, view, 3, True, monkeypatch)[0])
     shapes = [tiles.tile_shape(*size) for size in ((512, 512), (1, 1))]

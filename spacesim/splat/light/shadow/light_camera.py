@@ -5,6 +5,7 @@ Gaussians are, so that no step waits for the host.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import drjit as dr
@@ -37,18 +38,20 @@ def light_axes(direction: ArrayLike) -> Array:
     overhead, turned to s by the shortest way: continuous for all Suns but the one straight below, at -z, where x stays
     the world's. Raises InputError where the direction is none.
     """
-    return np.array(_axes(*np.asarray(direction, dtype=np.float64).ravel().tolist())).T
+    numbers = np.asarray(direction, dtype=np.float64)
+    return np.array(_axes(numbers.tolist() if numbers.shape == (3,) else Sun(numbers).direction.tolist())).T
 
 
-def _axes(*direction: float) -> list[list[float]]:
-    """The x, y and z axes of `light_axes`. Numbers of Python's: numpy takes ten times as long for three."""
+def _axes(direction: Sequence[float]) -> list[list[float]]:
+    """The x, y and z axes of `light_axes`, by numbers of Python's: numpy takes ten times as long for three."""
     length = math.hypot(*direction)
-    if len(direction) != 3 or not 0.5 < length < 2:  # which others are right a Sun says
+    if not 0.5 < length < 2:  # far from a unit vector, and perhaps none at all
         direction, length = Sun(np.array(direction)).direction.tolist(), 1.0
     x, y, z = (number / length for number in direction)
     across = x * x + y * y
     if across < UPRIGHT**2:
-        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]] if z > 0 else np.eye(3).tolist()
+        sign = -1.0 if z > 0 else 1.0
+        return [[1.0, 0.0, 0.0], [0.0, sign, 0.0], [0.0, 0.0, sign]]
     inverse = 1 / (1 + z) if z >= 0 else (1 - z) / across  # equal on the unit sphere; the latter does not cancel
     return [[1 - x * x * inverse, -x * y * inverse, -x], [x * y * inverse, y * y * inverse - 1, y], [-x, -y, -z]]
 
@@ -61,7 +64,7 @@ def light_rows(direction: ArrayLike) -> Float:
 
 @lru_cache(maxsize=SUNS)
 def _rows(*direction: float) -> Float:
-    return upload_numbers([number for axis in _axes(*direction) for number in axis])
+    return upload_numbers([number for axis in _axes(direction) for number in axis])
 
 
 def towards_sun(light: Float) -> Array3f:

@@ -42,9 +42,9 @@ class Extent:
     training: bool = False  #: a training step has to find place in memory, not a picture
 
     @staticmethod
-    @lru_cache(maxsize=256)
+    @lru_cache(maxsize=256, typed=True)
     def of(count: int, width: int, height: int, few_sizes: bool = False, training: bool = False) -> "Extent":
-        """The same one each time: to make what it says takes as long as a kernel."""
+        """The one of the last call like this one: to make what it says takes as long as a kernel."""
         return Extent(count, width, height, few_sizes, training)
 
     @property

@@ -39,7 +39,7 @@ def test_axes_are_continuous_save_for_the_sun_straight_below():
         assert np.abs(light_axes(near) - light_axes(sun)).max() < bound
 
 
-@pytest.mark.parametrize("sun", [[0, 0, 0], [np.nan, 0, 1], [0, 1]])
+@pytest.mark.parametrize("sun", [[0, 0, 0], [np.nan, 0, 1], [0, 1], [[0, 0.6, 0.8]]])
 def test_no_direction_is_one_sentence(sun):
     with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
         light_axes(sun)
