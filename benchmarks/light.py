@@ -12,6 +12,8 @@ them, "field" is the networks, "draw" the picture, both differences of medians, 
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from spacesim.data.geometry import fibonacci_sphere
 from spacesim.data.records import Sun
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
+from spacesim.splat.raster.lists.pictures import computed
 from spacesim.splat.raster.project import Pinhole
 from spacesim.splat.run import draw_lit
 from spacesim.splat.train.config import METHODS, preset
@@ -31,7 +34,7 @@ from spacesim.splat.train.config import METHODS, preset
 LIT = METHODS[1:]
 DIRECTION = 4, 1, 1  #: of the camera from the sphere
 SUNS = fibonacci_sphere(64)  #: of training steps
-NEW_SUNS = iter(np.random.default_rng(1).permutation(fibonacci_sphere(2**16)))  #: of frames: what one needs is kept
+NEW_SUNS = cycle(np.random.default_rng(1).permutation(fibonacci_sphere(2**16)))  #: of frames: what one needs is kept
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024", "llvm": "10000x256,30000x256"}
 STEPS = {"cuda": "100000x512", "llvm": "10000x128"}
 THESIS = {31622: 108, 101958: 77, 165495: 70}  #: frames per second (section 4.3.6, shadow mapping)
@@ -55,7 +58,7 @@ class Frame:
         dr.eval(self.gaussians.rows(), self.camera.values)
 
     def shadows(self) -> None:
-        dr.eval(self.light.shadows(self.gaussians, next(NEW_SUNS)))
+        dr.eval(computed(partial(self.light.shadows, self.gaussians, next(NEW_SUNS))))
 
     def shade(self) -> None:
         """Shadows and field."""

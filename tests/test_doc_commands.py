@@ -61,7 +61,7 @@ NOT_RUN = {  # commands with these words: why they do not run here
     "spacesim reproduce": "minutes with --quick, else a day; tests/test_reproduce.py does all of it at its smallest",
     "tests/scenes/truth.py": "a minute; tests/scenes/test_truth.py bounds its figures",
     "tests/scenes/generation/kills.py": "minutes; test_workers.py beside it kills and interrupts smaller runs",
-    "tests/splat/accuracy.py": "20 seconds; the tests beside it bound its figures",
+    "tests/splat/accuracy.py": "12 seconds; test_accuracy.py beside it bounds its figures",
     "tests/splat/raster/disc_outlines.py": "asks for a trained run with discs; the tests beside it hold its numbers",
     "tests/splat/light/shadow/acne.py": "a minute; the tests beside it bound its figures",
     "tests/splat/light/shadow/against_truth.py": "asks for a run that has been trained to the end",

@@ -38,8 +38,13 @@ def light_axes(direction: ArrayLike) -> Array:
     overhead, turned to s by the shortest way: continuous for all Suns but the one straight below, at -z, where x stays
     the world's. Raises InputError where the direction is none.
     """
+    return np.array(_axes(_numbers(direction))).T
+
+
+def _numbers(direction: ArrayLike) -> list[float]:
+    """Three of Python's. Raises InputError where it has another shape."""
     numbers = np.asarray(direction, dtype=np.float64)
-    return np.array(_axes(numbers.tolist() if numbers.shape == (3,) else Sun(numbers).direction.tolist())).T
+    return (numbers if numbers.shape == (3,) else Sun(numbers).direction).tolist()
 
 
 def _axes(direction: Sequence[float]) -> list[list[float]]:
@@ -58,8 +63,8 @@ def _axes(direction: Sequence[float]) -> list[list[float]]:
 
 def light_rows(direction: ArrayLike) -> Float:
     """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another. Kept for the next
-    picture under this Sun."""
-    return _rows(*np.asarray(direction, dtype=np.float64).tolist())
+    picture under this Sun. Raises InputError as it does."""
+    return _rows(*_numbers(direction))
 
 
 @lru_cache(maxsize=SUNS)

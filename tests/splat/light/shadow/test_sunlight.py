@@ -41,8 +41,9 @@ def test_axes_are_continuous_save_for_the_sun_straight_below():
 
 @pytest.mark.parametrize("sun", [[0, 0, 0], [np.nan, 0, 1], [0, 1], [[0, 0.6, 0.8]]])
 def test_no_direction_is_one_sentence(sun):
-    with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
-        light_axes(sun)
+    for function in (light_axes, light_rows):
+        with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
+            function(sun)
 
 
 @pytest.mark.parametrize("crop", [True, False])
