@@ -122,8 +122,9 @@ def generate(
     rig: `PoseRig` of cameras of your own, or another `Rig`;  trajectory: a table that cameras follow
         (docs/how-to/trajectory.md)
     options: of the scene, as the command line has them: suns, views (under each Sun), test_suns, test_views,
-        sun=(azimuth, elevation) in degrees or several, distance in metres, resolution=256 or (width, height) in pixels,
-        fov_deg, exposure (display value of a radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed
+        sun=(azimuth, elevation) in degrees, a direction [3], a `Sun` or several, distance in metres, resolution=256 or
+        (width, height) in pixels, fov_deg, exposure (display value of a radiance of 1 W m^-2 sr^-1), spp (samples a
+        pixel), seed
     progress: called with (frames done, frames in all, name of the frame last done)
 
     Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk, memory or processes fail,
@@ -313,7 +314,7 @@ def render(
     features: C arrays [N] of numbers to blend beside them
     antialiased: with Mip-Splatting's 2D filter; see docs/how-to/gradients.md for all of these
 
-    `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises ValueError for
+    `RenderOutput.to_numpy()` gives (colour [H, W, 3], alpha [H, W], depth [H, W] in metres). Raises InputError for
     another output or degree, features or a twist of another length, BackendError where no backend can run.
     """
     if not isinstance(gaussians, Gaussians):

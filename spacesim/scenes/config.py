@@ -1,14 +1,17 @@
 """What a scene file says: spacecraft and poses, materials, sources, rig, camera, quality."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from spacesim.data.errors import InputError, expect
 from spacesim.data.files import JsonDict
+from spacesim.data.records import Sun
 from spacesim.data.structure import did_you_mean, field_value
 from spacesim.scenes.background.config import BackgroundConfig
 from spacesim.scenes.cameras.camera import CameraConfig
@@ -162,9 +165,9 @@ class SceneConfig:
 def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
     """`scene` with its name, seed or min_sunlit, or fields of its rig, camera or quality changed by name; None changes
     nothing. `rig` is a rig in place of the scene's own, and `trajectory` the table that such a one follows (`FileRig`).
-    `resolution` may be one number, of a square, and `sun` one (azimuth, elevation). `sun` takes the place of the rig's
-    own arrangement, whatever the number of its Suns, and `suns` alone that of `sun`. `background` is a
-    `BackgroundConfig`, or words that say what the scene's own draws.
+    `resolution` may be one number, of a square, and `sun` (azimuth, elevation) in degrees, a direction [3], a `Sun`, or
+    several of them. `sun` takes the place of the rig's own arrangement, whatever the number of its Suns, and `suns`
+    alone that of `sun`. `background` is a `BackgroundConfig`, or words that say what the scene's own draws.
 
     Raises InputError for a name that this scene's rig does not know, or a value out of range.
     """
@@ -187,7 +190,7 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
             raise InputError(f"{name}: expected {_options_of(scene, name, names_by_part)}")
         if value is not None:
             value = (value, value) if name == "resolution" and isinstance(value, int) else value
-            value = [value] if name == "sun" and _is_direction(value) else value
+            value = _angles_of(value) if name == "sun" else value
             of_words = name == "background"  # which is a record or the words of one
             changes[part][name] = value if of_words else field_value(type(_part(scene, part)), name, value)
     rig = changes["rig"]
@@ -206,9 +209,19 @@ def _part(scene: SceneConfig, name: str) -> object:
     return getattr(scene, name) if name else scene
 
 
-def _is_direction(value: object) -> bool:
-    """Whether `value` is (azimuth, elevation) of one Sun."""
-    return isinstance(value, Sequence | np.ndarray) and np.shape(value) == (2,)
+def _angles_of(suns: Any) -> Any:
+    """A Sun, or several, as (azimuth, elevation) each; what is none stays as it is."""
+    if isinstance(suns, Sun) or _are_numbers(suns):
+        suns = [suns]
+    if not isinstance(suns, list | tuple | np.ndarray):
+        return suns
+    return [sun.angles if isinstance(sun, Sun) else Sun(sun).angles if _are_numbers(sun, 3) else sun for sun in suns]
+
+
+def _are_numbers(value: Any, count: int | None = None) -> bool:
+    """Whether it is a list of numbers, of so many."""
+    is_list = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim == 1)
+    return is_list and count in (None, len(value)) and all(isinstance(number, Real) for number in value)
 
 
 def _options_of(scene: SceneConfig, name: str, names_by_part: Mapping[str, Iterable[str]]) -> str:

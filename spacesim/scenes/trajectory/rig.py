@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -211,7 +212,7 @@ class PoseRig(Rig):
     """Cameras of your own, as arrays: `ss.generate("boxsat", "data", rig=ss.PoseRig(poses, sun=(40, 25)))`.
 
     world_from_camera: [N, 4, 4], OpenCV axes, metres
-    sun: (azimuth, elevation) in degrees [2], or a direction [3]; or one for each pose, [N, 2] or [N, 3]
+    sun: (azimuth, elevation) in degrees [2], a direction [3] or a `Sun`; or one for each pose, N of a form
     test: world_from_camera [M, 4, 4] of testing
     test_sun: as `sun`, of these; None: as `sun`
     time: [N] seconds, written with the frames
@@ -221,9 +222,9 @@ class PoseRig(Rig):
     """
 
     world_from_camera: ArrayLike  #: [N, 4, 4]
-    sun: ArrayLike = SINGLE_SUN  #: [2] or [3], or one for each pose
+    sun: ArrayLike | Sun | Sequence[Sun] = SINGLE_SUN  #: one, or one for each pose
     test: ArrayLike = ()  #: [M, 4, 4]
-    test_sun: ArrayLike | None = None  #: as `sun`
+    test_sun: ArrayLike | Sun | Sequence[Sun] | None = None  #: as `sun`
     time: ArrayLike | None = None  #: [N] seconds
     exposure: ArrayLike | None = None  #: [N]
 
@@ -277,7 +278,7 @@ class PoseRig(Rig):
         count = len(self._poses("test", self.test)) if test else len(self._poses("", self.world_from_camera))
         if test and self.test_sun is not None:
             name, value = "test_sun", self.test_sun
-        suns = _array(name, value)
+        suns = _array(name, _directions(value))
         if suns.ndim == 1:
             sun = Sun.of(suns.tolist())
             return [sun] * count if sun is not None else []
@@ -297,6 +298,15 @@ class PoseRig(Rig):
         if numbers.shape != (count,) or not np.isfinite(numbers).all():
             raise InputError(f"{name}: expected {count} finite numbers, one for each pose, found {list(numbers.shape)}")
         return numbers
+
+
+def _directions(suns: Any) -> Any:
+    """Suns, where there are some, as their directions."""
+    if isinstance(suns, Sun):
+        return suns.direction
+    if isinstance(suns, list | tuple):
+        return [sun.direction if isinstance(sun, Sun) else sun for sun in suns]
+    return suns
 
 
 def _array(name: str, value: ArrayLike) -> Array:

@@ -35,10 +35,33 @@ def test_poses_and_suns_of_ones_own(tmp_path):
     again = ss.generate("boxsat", tmp_path / "data", rig=rig, resume=True, **SMALL)
     assert len(again.frames) == 4
     other = ss.PoseRig(POSES[:3] + 0, sun=(10, 20), test=POSES[3:])
-    with pytest.raises(InputError, match="'suns' differs"):
+    with pytest.raises(InputError, match=r"was made with rig\.sha256 .*, expected the same to resume it"):
         ss.generate("boxsat", tmp_path / "data", rig=other, resume=True, **SMALL)
     with pytest.raises(InputError, match="rig: expected one that a scene file can say, found PoseRig"):
         scene_text(ss.read_scene("boxsat", rig=rig))
+
+
+def test_suns_are_taken_in_every_form(tmp_path):
+    """Angles, a direction, a record, or several of them, in a rig and beside a scene."""
+    of_record, direction = ss.Sun.from_angles(40, 25), [0.0, 0.6, 0.8]
+    for sun, angles in (((40, 25), (40, 25)), (of_record, (40, 25)), (direction, (90, np.degrees(np.arcsin(0.8))))):
+        for one in (sun, [sun] * len(POSES)):
+            rig = ss.PoseRig(POSES, sun=one, test=POSES[:1], test_sun=[sun])
+            views, tests = rig.views_of(None, ss.read_scene("boxsat").camera, 0)
+            assert [view.sun.angles for view in (*views, *tests)] == [pytest.approx(angles)] * 5
+        several = ss.read_scene("boxsat", sun=[sun, (10, 20)]).rig
+        assert ss.read_scene("boxsat", sun=sun).rig.sun == (pytest.approx(angles),)
+        assert several.sun == (pytest.approx(angles), (10, 20))
+        assert several.suns == 2
+    assert ss.read_scene("boxsat", sun=np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])).rig.sun == (
+        (1, 2),
+        (3, 4),
+        (5, 6),
+    )
+    with pytest.raises(InputError, match="sun"):
+        ss.read_scene("boxsat", sun="noon")
+    with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
+        ss.read_scene("boxsat", sun=(0, 0, 0))
 
 
 @dataclass(frozen=True)
