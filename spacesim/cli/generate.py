@@ -67,7 +67,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--frames", type=frame_range, metavar="A:B", help="make these frames alone; --resume completes the dataset"
     )
-    parser.add_argument("--resume", action="store_true", help="complete what an interrupted run left")
+    parser.add_argument(
+        "--resume", action="store_true", help="complete what the same command left when it was interrupted"
+    )
     many = parser.add_mutually_exclusive_group()
     many.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render (1)")
     many.add_argument(

@@ -198,3 +198,16 @@ def read_json(path: Path, most: int = MAX_JSON_BYTES) -> Any:
         raise
     except (ValueError, RecursionError) as error:  # malformed, no UTF-8, endless numbers or brackets
         raise InputError(f"{path}: expected JSON, found text that breaks off or is malformed ({error})") from None
+
+
+def first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, object, object] | None:
+    """(key, old value, new value) of the first key that one has otherwise; "light.field.width" within others."""
+    for key in {**new, **old}:
+        was, value = old.get(key), new.get(key)
+        if isinstance(was, dict) and isinstance(value, dict):
+            difference = first_difference(was, value, f"{within}{key}.")
+            if difference is not None:
+                return difference
+        elif was != value:
+            return f"{within}{key}", was, value
+    return None

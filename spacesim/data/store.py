@@ -21,6 +21,7 @@ from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import (
     MAX_LIST_BYTES,
     JsonValue,
+    first_difference,
     flush_disks,
     json_bytes,
     read_json,
@@ -33,6 +34,7 @@ from spacesim.data.integrity.manifest import check_manifest, digest_of, read_man
 from spacesim.data.integrity.whole import is_whole
 from spacesim.data.mesh import read_points, write_points
 from spacesim.data.records import Camera, Dataset, Frame, Sun, Truth, check_frame
+from spacesim.data.structure import shortened
 from spacesim.data.transforms import DEPTH_UNITS, MILLIMETRE, dataset_of, read_dataset
 
 if TYPE_CHECKING:
@@ -346,9 +348,13 @@ class DatasetWriter(FrameWriter):
         path = self.root / "scene.json"
         existing = read_json(path, MAX_LIST_BYTES)
         existing = existing if isinstance(existing, dict) else {}
-        for key in [*scene, *existing]:
-            if key not in existing or key not in scene or existing[key] != scene[key]:
-                raise InputError(f"{path}: expected the scene asked for, {key!r} differs; choose another folder")
+        there, asked = ({"config": one.get("config"), **one} for one in (existing, scene))  # first what was asked for
+        if found := first_difference(there, asked):
+            key, old, new = found
+            raise InputError(
+                f"{self.root}: was made with {key.removeprefix('config.')} {shortened(old)}, expected the same to "
+                f"resume it, found {shortened(new)}"
+            )
 
 
 def _can_be_decoded(path: Path) -> bool:

@@ -47,7 +47,7 @@ def read_record(path: Path, cls: type[T], rules: Rules | None = None, most: int 
     """
     values = read_json(path, most)
     if not isinstance(values, dict):
-        raise InputError(f"{path}: expected a JSON object, found {_short(values)}")
+        raise InputError(f"{path}: expected a JSON object, found {shortened(values)}")
     return structure(cls, Document(str(path), values, {}), rules or Rules()), values
 
 
@@ -188,7 +188,7 @@ def _python_value(hint: Any, name: str, value: object) -> Any:
     else:
         return value
     if not fits:
-        raise InputError(f"{name}: expected {expected}, found {_short(value)}")
+        raise InputError(f"{name}: expected {expected}, found {shortened(value)}")
     return value
 
 
@@ -344,11 +344,11 @@ class _Reader:
         self._refuse((*at, key), f"one of {', '.join(expected)}", key, hint)
 
     def _refuse(self, at: Keys, expected: str, found: object, hint: str = "") -> NoReturn:
-        what = "none" if found is None else _short(found)
+        what = "none" if found is None else shortened(found)
         raise InputError(f"{self._document.label(at)}: expected {expected}, found {what}{hint}")
 
 
-def _short(value: object) -> str:
+def shortened(value: object) -> str:
     if isinstance(value, Mapping):
         return "a table"
     text = repr(value)

@@ -15,7 +15,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, holds_files, read_json, remove_leftovers, write_json
+from spacesim.data.files import JsonDict, first_difference, holds_files, read_json, remove_leftovers, write_json
 from spacesim.data.identity import same_digest, training_digest
 from spacesim.data.integrity.whole import check_pictures
 from spacesim.data.lock import lock_folder
@@ -192,7 +192,7 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
     if same_digest(str(data.get("digest")), described["data"]["digest"]):
         data["digest"] = described["data"]["digest"]  # older versions wrote less
     current = {**config.to_json(), "data": data}  # what an older version did not write is as by default
-    difference = _first_difference(current, described)
+    difference = first_difference(current, described)
     if difference is not None:
         raise started_with(out, *difference)
 
@@ -200,20 +200,6 @@ def _check_resumable(out: Path, described: JsonDict, resume: bool, read_config: 
 def started_with(out: Path, key: str, old: object, new: object) -> InputError:
     """What refuses to resume the run in `out` with another value of a key than its own."""
     return InputError(f"{out}: was started with {key} {old!r}, expected the same to resume it, found {new!r}")
-
-
-def _first_difference(old: JsonDict, new: JsonDict, within: str = "") -> tuple[str, object, object] | None:
-    """(key, old value, new value) of the first key of `new` that `old` has otherwise; "light.field.width" within
-    others."""
-    for key, value in new.items():
-        was = old.get(key)
-        if isinstance(was, dict) and isinstance(value, dict):
-            difference = _first_difference(was, value, f"{within}{key}.")
-            if difference is not None:
-                return difference
-        elif was != value:
-            return f"{within}{key}", was, value
-    return None
 
 
 def _read_seconds(path: Path) -> dict[str, float]:

@@ -112,7 +112,10 @@ class TrainingLoop(ABC):
         command line, for the report."""
         newest = max(checkpoints(out), default=None)
         if newest is not None:
-            self.restore(newest)
+            try:
+                self.restore(newest)
+            except InputError as error:
+                raise InputError(f"{error}; without this file training goes on from an earlier one, or anew") from None
             log.info("resumed at iteration %d from %s", self.iteration, newest)
         clock = TrainingClock(out, self.iteration)
         self.seconds = {name: clock.kept.get(name, 0.0) if clock.before else 0.0 for name in self.seconds}

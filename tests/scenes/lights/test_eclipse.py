@@ -140,5 +140,5 @@ def test_frames_through_the_penumbra(tmp_path, caplog, lit_by_earth):
     warnings = [record.message for record in caplog.records if "in the dark" in record.message]
     assert warnings == [
         "generate: 2 of 4 frames show the object in the dark (train_00002 first, in 1 of them the Earth hides the Sun)"
-        "; max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out"
+        "; max_phase_deg = 90 in [rig] or min_sunlit = 0.05 (--min-sunlit) leaves them out"
     ]

@@ -313,7 +313,7 @@ def test_a_dataset_along_a_table(table, tmp_path):
     assert read_dataset(tmp_path / "a").train[1].time == 22.5
     assert [file["name"] for file in json.loads((tmp_path / "a/scene.json").read_text())["files"]] == ["path.csv"]
     table.write_text(table.read_text().replace("0.0,", "0.00,", 1))
-    with pytest.raises(InputError, match="'files' differs"):
+    with pytest.raises(InputError, match="was made with files "):
         generate(read_scene(scene, **SMALL, test_views=1), tmp_path / "a", resume=True)
 
 
@@ -355,7 +355,7 @@ def test_dark_frames_of_a_trajectory_are_counted_with_what_leaves_them_out(tmp_p
     generate(read_scene("boxsat", **SMALL, trajectory=circle(tmp_path / "p.csv")), tmp_path / "data")
     warnings = [record.getMessage() for record in caplog.records if "in the dark" in record.getMessage()]
     assert len(warnings) == 1
-    assert warnings[0].endswith("max_phase_deg = 90 in [rig] or min_sunlit = 0.05 leaves them out")
+    assert warnings[0].endswith("max_phase_deg = 90 in [rig] or min_sunlit = 0.05 (--min-sunlit) leaves them out")
 
 
 def test_an_exposure_for_each_frame(tmp_path):
