@@ -198,7 +198,7 @@ def test_verify_says_how_to_mend_what_was_imported(spacesim, tiny_data, tmp_path
     picture.write_bytes(picture.read_bytes()[:-40])
     done = spacesim("verify", tmp_path / "data")
     assert done.code == 1
-    assert done.errors[-1].endswith("1 faulty files; import it again, into a new folder")
+    assert done.errors[-1].endswith("1 faulty file; import it again, into a new folder")
     assert "generate" not in "".join(done.errors)
 
 

@@ -136,7 +136,7 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
         ("twist", 5, "6 finite numbers, found 5.0"),
         ("twist", [np.nan] * 6, "6 finite numbers, found "),
         ("twist", np.zeros((6, 2)), "6 finite numbers, found "),
-        ("outputs", "color", "some of color, .*, found 'color'"),
+        ("outputs", "colour", "some of color, .*, found 'colour'"),
         ("outputs", None, "some of color, .*, found None"),
         ("features", "ab", "arrays of .*, found 'ab'"),
         ("sh_degree", -1, "0 to"),

@@ -28,7 +28,8 @@ def run(options: argparse.Namespace) -> None:
     for problem in problems:
         print(problem, file=sys.stderr)
     if problems:
-        raise WorkError(f"{options.data}: {len(problems)} faulty files{repair_hint(dataset)}")
+        files = "faulty file" if len(problems) == 1 else "faulty files"
+        raise WorkError(f"{options.data}: {len(problems)} {files}{repair_hint(dataset)}")
     interrupts.print_output(f"{options.data}: {len(dataset.frames)} frames, every file is there and whole")
     if options.camera_density is not None:
         from spacesim.data.density import write_camera_density

@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonValue
-from spacesim.data.records import Camera, Sun
+from spacesim.data.records import Camera, Sun, check_camera
 from spacesim.data.structure import checked
 from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
 
@@ -39,6 +39,7 @@ class CameraClient:
         """The arrays that were asked for, by name. sun: as for `Run.render`; options: exposure (EV), outputs=("rgb",
         "depth", ...), seed, see spacesim/serve/protocol.py. Raises InputError for what cannot be, WorkError where
         no server answers."""
+        check_camera(camera)
         lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         fields = {"camera": {"world_from_camera": camera.world_from_camera.tolist(), **lens}, **options}
         if (towards := Sun.of(sun)) is not None:

@@ -328,7 +328,7 @@ def test_a_mesh_that_is_missing_costs_the_shape_alone(make_run, dataset, tmp_pat
 
 
 def test_no_frames(make_run, dataset, tmp_path):
-    with pytest.raises(InputError, match="expected frames in the split train, found none"):
+    with pytest.raises(InputError, match="expected frames in the split train, found none; test has some"):
         evaluate(make_run(), dataset, tmp_path / "eval", EvaluateConfig(split="train"))
     with pytest.raises(InputError, match="split"):
         EvaluateConfig(split="validation")

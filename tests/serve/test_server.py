@@ -254,6 +254,8 @@ def test_a_client_that_takes_no_answers_does_not_stop_the_others(ball, monkeypat
 
 def test_a_client_waits_no_longer_than_its_timeout():
     with CameraClient("tcp://127.0.0.1:9", timeout=0.1) as client:
+        with pytest.raises(InputError, match="camera: expected a Camera"):
+            client.picture(3, sun=(1, 2))
         for _ in range(2):
             with pytest.raises(WorkError, match=r"127.0.0.1:9: expected an answer within 0.1 s"):
                 client.picture(CAMERA, Sun(np.array([0.0, 0, 1])))

@@ -161,7 +161,8 @@ def fitted(lens: Lens, path: Path) -> Lens:
     width, height = image_size(path)
     if (width, height) == (lens.width, lens.height):
         return lens
-    if abs(width - lens.width * height / lens.height) > 1 and abs(height - lens.height * width / lens.width) > 1:
+    apart = abs(width - lens.width * height / lens.height), abs(height - lens.height * width / lens.width)
+    if min(apart) > 1 or width == lens.width or height == lens.height:
         expected = f"{lens.width}x{lens.height} pixels as its camera says, or a multiple or fraction"
         raise InputError(f"{path}: expected {expected}, found {width}x{height}")
     return lens.scaled(width, height)

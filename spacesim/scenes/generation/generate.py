@@ -101,7 +101,7 @@ def generate(
 
 def _against_dark_frames(config: SceneConfig) -> str:
     """What a scene that is made with dark frames can say to have none."""
-    limit = "" if config.min_sunlit else "min_sunlit = 0.05"
+    limit = "" if config.min_sunlit else "min_sunlit = 0.05 (--min-sunlit)"
     if isinstance(config.rig, RandomRig) and config.rig.max_phase_deg is None:
         phase = "max_phase_deg = 90 keeps the Sun on the camera's side, clear of the Earth"
         return f"{phase}; {limit} leaves them out" if limit else phase

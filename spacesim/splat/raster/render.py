@@ -5,6 +5,7 @@ What a picture shows beside colour is blended as features of the Gaussians: `ble
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 
@@ -12,6 +13,7 @@ from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.backend.upload import held
+from spacesim.data.errors import InputError
 from spacesim.data.structure import checked
 from spacesim.splat.raster.blend import blend_planes, rasterize
 from spacesim.splat.raster.cameras import Projection
@@ -37,7 +39,7 @@ def render(
     gaussians: Gaussians,
     camera: Projection,
     sh_degree: int | None = None,
-    outputs: Sequence[str] = ("color", "alpha", "depth"),
+    outputs: str | Sequence[str] = ("color", "alpha", "depth"),
     features: ArrayXf | Sequence[Float] | None = None,
     antialiased: Bool | bool = False,
 ) -> RenderOutput:
@@ -45,47 +47,48 @@ def render(
     `features` that has gradients enabled.
 
     sh_degree: highest degree of spherical harmonics used, all that are stored by default
-    outputs: of `OUTPUTS`, what to compute; alpha is always there
+    outputs: of `OUTPUTS`, what to compute, one or several; alpha is always there
     features: C arrays [N] (a list, or an ArrayXf [C, N]) to blend beside them; values not finite count as 0
     antialiased: see `project`
-    Raises ValueError for another output or degree, or features of another length.
+    Raises InputError for another output or degree, or features of another length.
     """
     try:
-        unknown: list[object] = [outputs] if isinstance(outputs, str) else [n for n in outputs if n not in OUTPUTS]
+        names: tuple[Any, ...] = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     except TypeError:
-        unknown = [outputs]
+        names = (outputs,)
+    unknown = [name for name in names if name not in OUTPUTS]
     if unknown:
-        raise ValueError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
+        raise InputError(f"outputs: expected some of {', '.join(OUTPUTS)}, found {unknown[0]!r}")
     if not isinstance(antialiased, bool | dr.ArrayBase):
-        raise ValueError(f"antialiased: expected true or false, found {antialiased!r}")
+        raise InputError(f"antialiased: expected true or false, found {antialiased!r}")
     try:
         feature_list = [] if features is None else [ad.Float(feature) for feature in features]
     except TypeError:
-        raise ValueError(f"features: expected arrays of {gaussians.count}, found {features!r:.60}") from None
+        raise InputError(f"features: expected arrays of {gaussians.count}, found {features!r:.60}") from None
     wrong_widths = [dr.width(feature) for feature in feature_list if dr.width(feature) not in (1, gaussians.count)]
     if wrong_widths:
-        raise ValueError(f"features: expected arrays of {gaussians.count}, found one of {wrong_widths[0]}")
+        raise InputError(f"features: expected arrays of {gaussians.count}, found one of {wrong_widths[0]}")
     if sh_degree is not None and not 0 <= sh_degree <= max(gaussians.sh_degree, 0):
-        raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, as stored, found {sh_degree}")
+        raise InputError(f"sh_degree: expected 0 to {gaussians.sh_degree}, as stored, found {sh_degree}")
     if gaussians.count == 0:
-        return _empty_output(camera, outputs, None if features is None else len(feature_list))
+        return _empty_output(camera, names, None if features is None else len(feature_list))
 
-    inputs = gaussians.rows(), camera, sh_degree, tuple(outputs), antialiased  # of `prepare`
+    inputs = gaussians.rows(), camera, sh_degree, names, antialiased  # of `prepare`
     more = {} if features is None else {"features": _whole_features(feature_list, gaussians.count)}
-    blended = sum(PLANES.get(name, 0) for name in outputs) + len(feature_list)
+    blended = sum(PLANES.get(name, 0) for name in names) + len(feature_list)
     splats: Splats | None
     if blended > FEATURES_PER_PASS or dr.grad_enabled(inputs[0], camera.values, feature_list):
         splats, footprints, groups = _prepare_all(inputs, more)
         lists, planes = _draw_in_stages(splats, footprints, groups, camera)
     else:
-        splats, lists, planes = _draw(inputs, more, "median_depth" in outputs)
+        splats, lists, planes = _draw(inputs, more, "median_depth" in names)
     return RenderOutput(
         color=ad.Array3f(planes["color"]) if "color" in planes else None,
         alpha=planes["alpha"][0],
         depth=planes["depth"][0] if "depth" in planes else None,
         width=camera.width,
         height=camera.height,
-        median_depth=median_depth(splats, lists, camera) if splats and lists and "median_depth" in outputs else None,
+        median_depth=median_depth(splats, lists, camera) if splats and lists and "median_depth" in names else None,
         normal=ad.Array3f(planes["normal"]) if "normal" in planes else None,
         features=planes.get("features"),
     )

@@ -242,6 +242,13 @@ def test_pictures_of_a_fraction_of_the_size(tmp_path):
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (8, 6, 10.0, 10.5, 3.75, 3.0)
 
 
+def test_a_picture_that_is_nearly_as_its_camera_says_is_refused(tmp_path):
+    """One side as the camera has it, the other a pixel off: no fraction."""
+    root = folder(tmp_path / "src", named(2), size=(16, 11))
+    with pytest.raises(InputError, match=r"expected 16x12 pixels as its camera says, or .* found 16x11"):
+        imported(root, tmp_path / "out")
+
+
 def blender(root):
     for split, count in (("train", 3), ("test", 2)):
         frames = [{"file_path": f"./{split}/r_{k}", "transform_matrix": POSE} for k in range(count)]

@@ -8,6 +8,7 @@ from splats import device_camera
 
 from spacesim.backend import ad
 from spacesim.backend.upload import upload
+from spacesim.data.errors import InputError
 from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.records import Camera
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
@@ -234,6 +235,10 @@ def test_wrong_requests_are_refused():
     gaussians, camera = Gaussians.from_numpy(random_splats(30)), device_camera(perspective())
     with pytest.raises(ValueError, match=r"outputs: expected some of color, alpha, .* found 'shade'"):
         render(gaussians, camera, outputs=("shade",))
+    assert render(gaussians, camera, outputs="color").depth is None, "one name"
+    for wrong in ("shade", 3, None):
+        with pytest.raises(InputError, match=r"outputs: expected some of color, alpha"):
+            render(gaussians, camera, outputs=wrong)
     with pytest.raises(ValueError, match="features: expected arrays of 30, found one of 29"):
         render(gaussians, camera, features=[dr.zeros(ad.Float, 30), dr.zeros(ad.Float, 29)])
     with pytest.raises(ValueError, match=r"name: expected one of the outputs asked for .* found 'normal'"):
