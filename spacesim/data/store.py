@@ -366,10 +366,10 @@ def _can_be_decoded(path: Path) -> bool:
     return True
 
 
-def find_unreadable_files(path: Path) -> list[str]:
-    """Sentences about what is wrong with a dataset folder, [] where every file is there and fits."""
+def find_unreadable_files(data: Path | Dataset) -> list[str]:
+    """Sentences about what is wrong with a dataset, or its folder, [] where every file is there and fits."""
     try:
-        dataset = read_dataset(path)
+        dataset = data if isinstance(data, Dataset) else read_dataset(data)
     except InputError as error:
         return [str(error)]
     problems = [f"{dataset.root / name}: expected an image file, found none" for name in dataset.missing]

@@ -29,7 +29,7 @@ def verify_files(path: Path) -> tuple[Dataset, list[str]]:
     changed |= {name: f"{dataset.root / NAME}: expected a digest of {name}, found none" for name in absent}
     reported = tuple(f"{dataset.root / name}:" for name in changed)
     faulty = [
-        words for words in find_unreadable_files(path) + _faulty_pictures(dataset) if not words.startswith(reported)
+        words for words in find_unreadable_files(dataset) + _faulty_pictures(dataset) if not words.startswith(reported)
     ]
     return dataset, [*changed.values(), *faulty]
 
