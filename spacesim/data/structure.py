@@ -349,6 +349,7 @@ class _Reader:
 
 
 def shortened(value: object) -> str:
+    """A value as sentences name it, in 60 characters at most."""
     if isinstance(value, Mapping):
         return "a table"
     text = repr(value)

@@ -105,8 +105,9 @@ def evaluate(
     config, dataset = config or EvaluateConfig(), check_still(dataset)
     frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
     if not frames:
-        other = "train" if config.split == "test" else "test"
-        raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none; {other} has some")
+        other = {"train": dataset.train, "test": dataset.test}
+        hint = "".join(f"; {name} has some" for name, some in other.items() if some)
+        raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none{hint}")
     alignment = align(as_trained(config.align, run.path), dataset) if config.align else None
     if alignment:
         if run.parts:

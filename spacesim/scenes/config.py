@@ -219,9 +219,11 @@ def _angles_of(suns: Any) -> Any:
 
 
 def _are_numbers(value: Any, count: int | None = None) -> bool:
-    """Whether it is a list of numbers, of so many."""
+    """Whether it is a list of numbers, of so many, or of one and more."""
     is_list = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim == 1)
-    return is_list and count in (None, len(value)) and all(isinstance(number, Real) for number in value)
+    if not is_list or not len(value) or count not in (None, len(value)):
+        return False
+    return all(isinstance(number, Real) for number in value)
 
 
 def _options_of(scene: SceneConfig, name: str, names_by_part: Mapping[str, Iterable[str]]) -> str:

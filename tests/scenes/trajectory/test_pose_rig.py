@@ -58,6 +58,7 @@ def test_suns_are_taken_in_every_form(tmp_path):
         (3, 4),
         (5, 6),
     )
+    assert ss.read_scene("boxsat", sun=()).rig.sun == ()
     with pytest.raises(InputError, match="sun"):
         ss.read_scene("boxsat", sun="noon")
     with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
