@@ -58,8 +58,9 @@ def test_suns_are_taken_in_every_form(tmp_path):
         (3, 4),
         (5, 6),
     )
-    assert ss.read_scene("boxsat", sun=()).rig.sun == ()
-    with pytest.raises(InputError, match="sun"):
+    with pytest.raises(InputError, match="suns: expected at least 1, found 0"):
+        ss.read_scene("boxsat", sun=[])
+    with pytest.raises(InputError, match="sun: expected a list"):
         ss.read_scene("boxsat", sun="noon")
     with pytest.raises(InputError, match="sun direction: expected 3 finite numbers"):
         ss.read_scene("boxsat", sun=(0, 0, 0))
