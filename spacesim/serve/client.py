@@ -1,6 +1,7 @@
 """A client of `spacesim serve`: one request, one answer."""
 
 import json
+import logging
 from collections.abc import Sequence
 from types import TracebackType
 
@@ -11,6 +12,10 @@ from spacesim.data.files import JsonValue
 from spacesim.data.records import Camera, Sun, check_camera
 from spacesim.data.structure import checked
 from spacesim.serve.protocol import VERSION, arrays_of, import_zmq
+
+PATIENCE = 5.0  #: seconds after which one who waits is told
+
+_log = logging.getLogger(__name__)
 
 
 class CameraClient:
@@ -45,9 +50,18 @@ class CameraClient:
         if (towards := Sun.of(sun)) is not None:
             fields["sun"] = towards.direction.tolist()
         self._socket.send(json.dumps({"version": VERSION, "id": 0, **fields}).encode())
-        if not self._socket.poll(round(1e3 * self.timeout)):
+        if not self._poll():
             raise WorkError(f"{self.address}: expected an answer within {self.timeout:g} s, found none")
         return arrays_of(self._socket.recv_multipart())
+
+    def _poll(self) -> bool:
+        """Whether an answer comes within `timeout` seconds; says so where it takes longer than `PATIENCE`."""
+        soon = min(PATIENCE, self.timeout)
+        if self._socket.poll(round(1e3 * soon)):
+            return True
+        if soon < self.timeout:
+            _log.warning("%s: no answer after %g s, waiting up to %g s", self.address, soon, self.timeout)
+        return bool(self._socket.poll(round(1e3 * (self.timeout - soon))))
 
     def close(self) -> None:
         """Hang up."""

@@ -67,7 +67,9 @@ def locate(
     for frame in frames:
         if run.relightable and sun is None and frame.sun is None:
             method = run.config["method"]
-            raise InputError(f"sun: expected the direction for a run of {method}, found none for {frame.file_path}")
+            hint = f", which {start} does not have" if start is not None and _guess(start_frames, frame) is None else ""
+            wanted = f"sun: expected the direction for a run of {method}"
+            raise InputError(f"{wanted}, found none for {frame.file_path}{hint}")
     settings: JsonDict = {
         "run": str(run.path),
         "gaussians": run.gaussian_count,

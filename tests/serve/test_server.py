@@ -14,6 +14,7 @@ from serving import CAMERA, SUN
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.images.tone import as_bytes
 from spacesim.data.records import Sun
+from spacesim.serve import client as client_module
 from spacesim.serve.client import CameraClient
 from spacesim.serve.draw import PredictedRun, load_served
 from spacesim.serve.protocol import OUTPUTS, arrays_of
@@ -252,13 +253,16 @@ def test_a_client_that_takes_no_answers_does_not_stop_the_others(ball, monkeypat
     assert caplog.messages.count(DROPPED) == 1
 
 
-def test_a_client_waits_no_longer_than_its_timeout():
+def test_a_client_waits_no_longer_than_its_timeout(monkeypatch, caplog):
+    monkeypatch.setattr(client_module, "PATIENCE", 0.02)
     with CameraClient("tcp://127.0.0.1:9", timeout=0.1) as client:
         with pytest.raises(InputError, match="camera: expected a Camera"):
             client.picture(3, sun=(1, 2))
         for _ in range(2):
+            caplog.clear()
             with pytest.raises(WorkError, match=r"127.0.0.1:9: expected an answer within 0.1 s"):
                 client.picture(CAMERA, Sun(np.array([0.0, 0, 1])))
+            assert caplog.messages == ["tcp://127.0.0.1:9: no answer after 0.02 s, waiting up to 0.1 s"]
 
 
 def test_addresses_that_cannot_be_had(ball):

@@ -209,6 +209,15 @@ def test_wrong_inputs_are_refused_in_a_sentence(run, pictures, tmp_path, change,
         locate(run, paths["images"], tmp_path / "out.json", paths["start"], paths["camera"])
 
 
+def test_a_picture_without_a_sun_that_the_start_lacks_is_named(run, pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr(Run, "relightable", True)
+    out, start = tmp_path / "out.json", tmp_path / "rough.json"
+    with pytest.raises(InputError, match=r"found none for dark\.png, which .*rough\.json does not have$"):
+        locate(run, pictures / "dark.png", out, start, tmp_path / "camera.json")
+    with pytest.raises(InputError, match=r"found none for 0\.png$"):
+        locate(run, pictures / "0.png", out, start)
+
+
 def test_the_command(spacesim, tiny_run, tiny_data, tmp_path):
     """Cameras are those of the poses to start from, or of the run's data."""
     folder, out = tmp_path / "pictures", tmp_path / "poses.json"
