@@ -103,10 +103,10 @@ def evaluate(
     WorkError where a prediction is not finite.
     """
     config, dataset = config or EvaluateConfig(), check_still(dataset)
-    frames = {"test": dataset.test, "train": dataset.train, "all": dataset.frames}[config.split]
+    splits = {"train": dataset.train, "test": dataset.test, "all": dataset.frames}
+    frames = splits[config.split]
     if not frames:
-        other = {"train": dataset.train, "test": dataset.test}
-        hint = "".join(f"; {name} has some" for name, some in other.items() if some)
+        hint = "".join(f"; {name} has some" for name in ("train", "test") if splits[name])
         raise InputError(f"{dataset.root}: expected frames in the split {config.split}, found none{hint}")
     alignment = align(as_trained(config.align, run.path), dataset) if config.align else None
     if alignment:

@@ -67,7 +67,8 @@ def locate(
     for frame in frames:
         if run.relightable and sun is None and frame.sun is None:
             method = run.config["method"]
-            hint = f", which {start} does not have" if start is not None and _guess(start_frames, frame) is None else ""
+            is_lacking = start is not None and _match(start_frames, frame.file_path) is None
+            hint = f", which {start} does not have" if is_lacking else ""
             wanted = f"sun: expected the direction for a run of {method}"
             raise InputError(f"{wanted}, found none for {frame.file_path}{hint}")
     settings: JsonDict = {

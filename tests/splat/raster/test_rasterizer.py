@@ -6,11 +6,12 @@ import drjit as dr
 import numpy as np
 import pytest
 from splats import random_splats, take_cudas
+from twin import record
 
 from spacesim.backend import Recorded, ad, select
 from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
-from spacesim.data.geometry import look_at, quaternion_from_rotation, rotation_from_quaternion
+from spacesim.data.geometry import quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
 from spacesim.splat.raster import blend as rasterize
 from spacesim.splat.raster import records, walks
@@ -47,8 +48,7 @@ def way(request, monkeypatch):
 
 
 def camera(width: int = SIZE[0], height: int = SIZE[1]) -> Camera:
-    pose = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
-    return Camera(pose, width, height, 1.3 * width, 1.2 * width, 0.52 * width, 0.47 * height)
+    return record("perspective", width, height)
 
 
 def placed_splats() -> dict[str, np.ndarray]:

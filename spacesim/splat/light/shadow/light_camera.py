@@ -5,7 +5,6 @@ Gaussians are, so that no step waits for the host.
 """
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import drjit as dr
@@ -38,21 +37,20 @@ def light_axes(direction: ArrayLike) -> Array:
     overhead, turned to s by the shortest way: continuous for all Suns but the one straight below, at -z, where x stays
     the world's. Raises InputError where the direction is none.
     """
-    return np.array(_axes(_numbers(direction))).T
+    return np.array(_axes(*_unit(direction))).T
 
 
-def _numbers(direction: ArrayLike) -> list[float]:
-    """Three of Python's. Raises InputError where it has another shape."""
+def _unit(direction: ArrayLike) -> list[float]:
+    """Unit vector, in numbers of Python's: numpy takes ten times as long for three. Raises InputError as `Sun`."""
     numbers = np.asarray(direction, dtype=np.float64)
-    return (numbers if numbers.shape == (3,) else Sun(numbers).direction).tolist()
-
-
-def _axes(direction: Sequence[float]) -> list[list[float]]:
-    """The x, y and z axes of `light_axes`, by numbers of Python's: numpy takes ten times as long for three."""
-    length = math.hypot(*direction)
+    length = math.hypot(*numbers.tolist()) if numbers.shape == (3,) else 0.0
     if not 0.5 < length < 2:  # far from a unit vector, and perhaps none at all
-        direction, length = Sun(np.array(direction)).direction.tolist(), 1.0
-    x, y, z = (number / length for number in direction)
+        return list(Sun(numbers).direction.tolist())
+    return [number / length for number in numbers.tolist()]
+
+
+def _axes(x: float, y: float, z: float) -> list[list[float]]:
+    """The x, y and z axes of `light_axes` for a unit vector."""
     across = x * x + y * y
     if across < UPRIGHT**2:
         sign = -1.0 if z > 0 else 1.0
@@ -64,12 +62,12 @@ def _axes(direction: Sequence[float]) -> list[list[float]]:
 def light_rows(direction: ArrayLike) -> Float:
     """`light_axes` for the kernels: Float [9], the light camera's x, y and z axes one after another. Kept for the next
     picture under this Sun. Raises InputError as it does."""
-    return _rows(*_numbers(direction))
+    return _rows(*_unit(direction))
 
 
 @lru_cache(maxsize=SUNS)
-def _rows(*direction: float) -> Float:
-    return upload_numbers([number for axis in _axes(direction) for number in axis])
+def _rows(x: float, y: float, z: float) -> Float:
+    return upload_numbers([number for axis in _axes(x, y, z) for number in axis])
 
 
 def towards_sun(light: Float) -> Array3f:
