@@ -12,7 +12,15 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from spacesim.data.errors import InputError
-from spacesim.data.exporters import LabelledObject, labelled_objects, write_bop, write_speedplus
+from spacesim.data.exporters import (
+    LabelledObject,
+    labelled_objects,
+    write_bop,
+    write_coco,
+    write_speedplus,
+    write_webdataset,
+    write_yolo,
+)
 from spacesim.data.exporters.objects import opaque_picture
 from spacesim.data.exporters.speedplus import _label
 from spacesim.data.files import read_json, write_json
@@ -271,6 +279,39 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     write_json(tmp_path / "old/scene.json", scene)
     with pytest.raises(InputError, match=r"scene\.json: expected the exposure and the tone, found none"):
         write_speedplus(read_dataset(tmp_path / "old"), tmp_path / "d")
+
+
+@pytest.mark.parametrize("write", [write_coco, write_yolo, write_webdataset, write_speedplus, write_bop])
+def test_an_interrupted_export_leaves_nothing_in_the_way(write, data, tmp_path, monkeypatch):
+    monkeypatch.setattr("spacesim.data.exporters.webdataset.MOST", 1)  # a shard for each picture
+    rest = (silhouette_finder,) if write is write_bop else (None,) if write is write_speedplus else ()
+
+    def stop(done: int, _count: int, _name: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    for out in (tmp_path / "new", tmp_path / "there"):
+        if was_there := out.name == "there":
+            (out / ".part").mkdir(parents=True)
+            (out / ".part/old").write_text("of a process that was killed")
+        with pytest.raises(KeyboardInterrupt):
+            write(read_dataset(data), out, *rest, progress=stop)
+        assert list(tmp_path.iterdir()) == [out] * was_there
+        assert not was_there or not list(out.iterdir())
+        write(read_dataset(data), out, *rest)
+        assert len(list(out.rglob("*.tar" if write is write_webdataset else "*.png"))) >= 6
+        assert not [path for name in ("old", ".part") for path in out.rglob(name)]
+        shutil.rmtree(out)
+
+
+def test_two_exports_into_one_folder_do_not_mix(data, tmp_path):
+    dataset = read_dataset(data)
+
+    def another(_done: int, _count: int, _name: str) -> None:
+        with pytest.raises(InputError, match="expected no other run at work in the folder"):
+            write_coco(dataset, tmp_path / "coco")
+
+    write_coco(dataset, tmp_path / "coco", progress=another)
 
 
 def test_commands(spacesim, data, tmp_path):

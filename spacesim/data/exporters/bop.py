@@ -77,31 +77,31 @@ def write_bop(
             raise InputError(f"{frame.file_path}: expected an image without lens distortion, which BOP does not know")
     targets = labelled_objects(dataset)
     bodies = body_labels(dataset, targets, keypoints)
-    out = new_folder(out)
-    models = model_numbers(targets)
-    _write_models(out, targets, models, bodies)
-    write_body_labels(out / NAME, bodies)
-    find = outline(targets)
-    done = 0
-    for split, frames in (("train", dataset.train), ("test", dataset.test)):
-        scene = out / split / "000000"
-        cameras, poses, infos = {}, {}, {}
-        for image, frame in enumerate(frames):
-            placed = [target.at(frame) for target in targets]
-            finder = outline(placed) if frame.objects else find
-            cameras[str(image)], infos[str(image)] = _write_frame(scene, image, dataset, frame, targets, finder)
-            poses[str(image)] = [_pose(frame.camera, *pair) for pair in zip(placed, models, strict=True)]
-            done += 1
-            if progress is not None:
-                progress(done, len(dataset.frames), frame.file_path)
-        if frames:
-            write_json(scene / "scene_camera.json", cameras)
-            write_json(scene / "scene_gt.json", poses)
-            write_json(scene / "scene_gt_info.json", infos)
-        if split == "test":
-            write_json(out / "test_targets_bop19.json", _test_targets(infos, models))
-    write_json(out / "camera.json", _sensor(dataset.frames[0].camera))
-    return targets
+    with new_folder(out) as out:
+        models = model_numbers(targets)
+        _write_models(out, targets, models, bodies)
+        write_body_labels(out / NAME, bodies)
+        find = outline(targets)
+        done = 0
+        for split, frames in (("train", dataset.train), ("test", dataset.test)):
+            scene = out / split / "000000"
+            cameras, poses, infos = {}, {}, {}
+            for image, frame in enumerate(frames):
+                placed = [target.at(frame) for target in targets]
+                finder = outline(placed) if frame.objects else find
+                cameras[str(image)], infos[str(image)] = _write_frame(scene, image, dataset, frame, targets, finder)
+                poses[str(image)] = [_pose(frame.camera, *pair) for pair in zip(placed, models, strict=True)]
+                done += 1
+                if progress is not None:
+                    progress(done, len(dataset.frames), frame.file_path)
+            if frames:
+                write_json(scene / "scene_camera.json", cameras)
+                write_json(scene / "scene_gt.json", poses)
+                write_json(scene / "scene_gt_info.json", infos)
+            if split == "test":
+                write_json(out / "test_targets_bop19.json", _test_targets(infos, models))
+        write_json(out / "camera.json", _sensor(dataset.frames[0].camera))
+        return targets
 
 
 def _write_frame(

@@ -32,36 +32,36 @@ def write_coco(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    out = new_folder(out)
-    categories = [
-        {
-            "id": category.number,
-            "name": category.name,
-            "supercategory": "spacecraft",
-            "keypoints": list(category.body.keypoints),
-            "skeleton": [],
-        }
-        for category in labeller.categories
-    ]
-    names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
-    splits = {"train": dataset.train, "val": dataset.test}
-    images: dict[str, list[JsonDict]] = {split: [] for split in splits}
-    annotations: dict[str, list[JsonDict]] = {split: [] for split in splits}
-    tested = set(dataset.test)
-    for number, (frame, instances) in enumerate(labeller.frames(dataset.frames, progress), start=1):
-        split = "val" if frame in tested else "train"
-        write_png(out / split / f"{names[frame]}.png", opaque_picture(dataset, frame), durable=False)
-        images[split].append(_image(number, f"{names[frame]}.png", frame))
-        annotations[split] += [_annotation(number, instance) for instance in instances]
-    total = 0
-    for split in splits:
-        for annotation in annotations[split]:
-            total += 1
-            annotation["id"] = total  # 0 would be taken for none
-        content = {"images": images[split], "annotations": annotations[split], "categories": categories}
-        write_json(out / f"annotations/{split}.json", {"info": {"description": dataset.root.name}, **content})
-    write_body_labels(out / NAME, labeller.bodies)
-    return total
+    with new_folder(out) as out:
+        categories = [
+            {
+                "id": category.number,
+                "name": category.name,
+                "supercategory": "spacecraft",
+                "keypoints": list(category.body.keypoints),
+                "skeleton": [],
+            }
+            for category in labeller.categories
+        ]
+        names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
+        splits = {"train": dataset.train, "val": dataset.test}
+        images: dict[str, list[JsonDict]] = {split: [] for split in splits}
+        annotations: dict[str, list[JsonDict]] = {split: [] for split in splits}
+        tested = set(dataset.test)
+        for number, (frame, instances) in enumerate(labeller.frames(dataset.frames, progress), start=1):
+            split = "val" if frame in tested else "train"
+            write_png(out / split / f"{names[frame]}.png", opaque_picture(dataset, frame), durable=False)
+            images[split].append(_image(number, f"{names[frame]}.png", frame))
+            annotations[split] += [_annotation(number, instance) for instance in instances]
+        total = 0
+        for split in splits:
+            for annotation in annotations[split]:
+                total += 1
+                annotation["id"] = total  # 0 would be taken for none
+            content = {"images": images[split], "annotations": annotations[split], "categories": categories}
+            write_json(out / f"annotations/{split}.json", {"info": {"description": dataset.root.name}, **content})
+        write_body_labels(out / NAME, labeller.bodies)
+        return total
 
 
 def _image(number: int, name: str, frame: Frame) -> JsonDict:

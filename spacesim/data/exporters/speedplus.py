@@ -63,30 +63,32 @@ def write_speedplus(
         raise InputError(f"keypoints: expected with a dataset that has a mesh, found {dataset.root}, an import")
     target = select_object(labeller.targets if labeller else [BODY], target_name)
     camera = _camera(dataset.frames)
-    out = new_folder(out)
-    frames = dataset.frames
-    names = [f"{name}.png" for name in frame_names(frames)]
-    points: JsonDict = {}
-    for number, (name, frame) in enumerate(zip(names, frames, strict=True), start=1):
-        write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
-        mask = None
+    with new_folder(out) as out:
+        frames = dataset.frames
+        names = [f"{name}.png" for name in frame_names(frames)]
+        points: JsonDict = {}
+        for number, (name, frame) in enumerate(zip(names, frames, strict=True), start=1):
+            write_png(out / "synthetic/images" / name, opaque_picture(dataset, frame), durable=False)
+            mask = None
+            if labeller is not None:
+                (instance,) = (one for one in labeller.instances(frame) if one.target.id == target.id)
+                mask, points[name] = instance.mask, instance.keypoints.tolist()
+            elif frame.silhouette_path is not None:
+                mask = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0
+            if mask is not None:
+                write_png(out / "synthetic/masks" / name, np.where(mask, 255, 0).astype(np.uint8), durable=False)
+            if progress is not None:
+                progress(number, len(frames), frame.file_path)
+        labels = [
+            _label(name, frame, target, kept.get(frame.file_path)) for name, frame in zip(names, frames, strict=True)
+        ]
+        write_json(out / "synthetic/train.json", labels[: len(dataset.train)])
+        write_json(out / "synthetic/validation.json", labels[len(dataset.train) :])
         if labeller is not None:
-            (instance,) = (one for one in labeller.instances(frame) if one.target.id == target.id)
-            mask, points[name] = instance.mask, instance.keypoints.tolist()
-        elif frame.silhouette_path is not None:
-            mask = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0
-        if mask is not None:
-            write_png(out / "synthetic/masks" / name, np.where(mask, 255, 0).astype(np.uint8), durable=False)
-        if progress is not None:
-            progress(number, len(frames), frame.file_path)
-    labels = [_label(name, frame, target, kept.get(frame.file_path)) for name, frame in zip(names, frames, strict=True)]
-    write_json(out / "synthetic/train.json", labels[: len(dataset.train)])
-    write_json(out / "synthetic/validation.json", labels[len(dataset.train) :])
-    if labeller is not None:
-        write_json(out / "synthetic/keypoints.json", points)
-        write_body_labels(out / NAME, [body for body in labeller.bodies if body.id == target.id])
-    write_json(out / "camera.json", camera)
-    return target
+            write_json(out / "synthetic/keypoints.json", points)
+            write_body_labels(out / NAME, [body for body in labeller.bodies if body.id == target.id])
+        write_json(out / "camera.json", camera)
+        return target
 
 
 def _kept_labels(dataset: Dataset) -> dict[str, JsonDict]:

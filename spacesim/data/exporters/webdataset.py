@@ -36,19 +36,19 @@ def write_webdataset(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    out = new_folder(out)
-    names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
-    done, shards = 0, 0
-    for split, frames in (("train", dataset.train), ("val", dataset.test)):
-        shard = _Shard(out, split)
-        for frame, instances in labeller.frames(frames):
-            shard.add(names[frame].replace(".", "_"), _sample(dataset, frame, instances))
-            done += 1
-            if progress is not None:
-                progress(done, len(dataset.frames), frame.file_path)
-        shards += shard.close()
-    write_body_labels(out / NAME, labeller.bodies)
-    return shards
+    with new_folder(out) as out:
+        names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
+        done, shards = 0, 0
+        for split, frames in (("train", dataset.train), ("val", dataset.test)):
+            shard = _Shard(out, split)
+            for frame, instances in labeller.frames(frames):
+                shard.add(names[frame].replace(".", "_"), _sample(dataset, frame, instances))
+                done += 1
+                if progress is not None:
+                    progress(done, len(dataset.frames), frame.file_path)
+            shards += shard.close()
+        write_body_labels(out / NAME, labeller.bodies)
+        return shards
 
 
 class _Shard:

@@ -36,25 +36,25 @@ def write_yolo(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    out = new_folder(out)
-    classes = [category.name for category in labeller.categories]
-    most = max(len(body.keypoints) for body in labeller.bodies)
-    names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
-    tested, total = set(dataset.test), 0
-    for frame, instances in labeller.frames(dataset.frames, progress):
-        split, name = "val" if frame in tested else "train", names[frame]
-        first = out / TASKS[0] / "images" / split / f"{name}.png"
-        write_png(first, opaque_picture(dataset, frame), durable=False)
+    with new_folder(out) as out:
+        classes = [category.name for category in labeller.categories]
+        most = max(len(body.keypoints) for body in labeller.bodies)
+        names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
+        tested, total = set(dataset.test), 0
+        for frame, instances in labeller.frames(dataset.frames, progress):
+            split, name = "val" if frame in tested else "train", names[frame]
+            first = out / TASKS[0] / "images" / split / f"{name}.png"
+            write_png(first, opaque_picture(dataset, frame), durable=False)
+            for task in TASKS:
+                lines = [_line(task, instance, most) for instance in instances]
+                write_bytes(out / task / "labels" / split / f"{name}.txt", "".join(lines).encode(), durable=False)
+                if task != TASKS[0]:
+                    _link(first, out / task / "images" / split / f"{name}.png")
+            total += len(instances)
         for task in TASKS:
-            lines = [_line(task, instance, most) for instance in instances]
-            write_bytes(out / task / "labels" / split / f"{name}.txt", "".join(lines).encode(), durable=False)
-            if task != TASKS[0]:
-                _link(first, out / task / "images" / split / f"{name}.png")
-        total += len(instances)
-    for task in TASKS:
-        write_bytes(out / task / "data.yaml", _description(task, classes, most, bool(dataset.test)).encode())
-    write_body_labels(out / NAME, labeller.bodies)
-    return total
+            write_bytes(out / task / "data.yaml", _description(task, classes, most, bool(dataset.test)).encode())
+        write_body_labels(out / NAME, labeller.bodies)
+        return total
 
 
 def _line(task: str, instance: Instance, most: int) -> str:
