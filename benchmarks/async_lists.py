@@ -95,7 +95,7 @@ def make_trainer(folder: Path, count: int, pixels: int, method: str, size: str) 
     if method == "vanilla":
         return still_trainer(data, count, common.sphere_arrays(count))
     lit = [replace(frame, sun=Sun(SUNS[i])) for i, frame in enumerate(data.train)]
-    return still_trainer(replace(data, train=tuple(lit)), count, light=preset(size, method).light)
+    return still_trainer(replace(data, train=tuple(lit)), count, base=preset(size, method))
 
 
 if __name__ == "__main__":

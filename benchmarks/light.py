@@ -2,11 +2,11 @@
 
     python benchmarks/light.py [--methods relight,shadow-map] [--preset fast] [--sizes 31622x1024] [--markdown]
 
-The scene is the sphere of random splats of the other benchmarks, with untrained networks of the preset's size: how
-long these take does not depend on what they have learned, but light that bounces and who is hidden are the sphere's. A
-frame is what `spacesim render RUN --sun AZ,EL` draws, left on the device, each time under another Sun. "shadows" casts
-them, "field" is the networks, "draw" the picture, both differences of medians, which a host that drifts may push below
-0; "kernels" is what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
+The scene is the sphere of random splats of the other benchmarks, with the preset's settings and untrained networks:
+how long these take does not depend on what they have learned, but light that bounces and who is hidden are the
+sphere's. A frame is what `spacesim render RUN --sun AZ,EL` draws, left on the device, each time under another Sun.
+"shadows" casts them, "field" is the networks, "draw" the picture, both differences of medians, which a host that drifts
+may push below 0; "kernels" is what the device alone needs. The thesis's frames (RTX 5000 Ada) stand beside ours.
 """
 
 import sys
@@ -28,6 +28,7 @@ from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.pictures import computed
 from spacesim.splat.raster.project import Pinhole
+from spacesim.splat.raster.supersample import render_supersampled, upsampled_camera
 from spacesim.splat.run import draw_lit
 from spacesim.splat.train.config import METHODS, preset
 
@@ -50,11 +51,20 @@ class Frame:
     """A relightable sphere and the parts of its picture. Each call has another Sun."""
 
     def __init__(self, count: int, pixels: int, method: str, size: str) -> None:
-        config = preset(size, method).light
-        assert config is not None
-        self.gaussians = Gaussians.from_numpy(lit_arrays(count, config.features))
-        self.light = LightModel.initial(config, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), 0)
-        self.camera = Pinhole.of(common.camera_from(DIRECTION, pixels))
+        config = preset(size, method)
+        assert config.light is not None
+        self.gaussians = Gaussians.from_numpy(lit_arrays(count, config.light.features))
+        self.light = LightModel.initial(config.light, TrainingFrame(np.zeros(3), 1.0, common.DISTANCE, 1.0), 0)
+        camera = common.camera_from(DIRECTION, pixels)
+        self.camera = Pinhole.of(upsampled_camera(camera, config.supersample))
+        self.draw = partial(
+            render_supersampled,
+            camera=camera,
+            times=config.supersample,
+            colors=3,
+            linear=config.light.curve is not None,
+        )
+        self.antialiased = config.antialiased
         dr.eval(self.gaussians.rows(), self.camera.values)
 
     def shadows(self) -> None:
@@ -65,14 +75,17 @@ class Frame:
         dr.eval(self.light.shade_picture(self.gaussians, self.camera, next(NEW_SUNS)))
 
     def frame(self) -> None:
-        output = draw_lit(self.gaussians, self.light, self.camera, next(NEW_SUNS))
+        sun, antialiased = next(NEW_SUNS), self.antialiased
+        output = self.draw(lambda camera: draw_lit(self.gaussians, self.light, camera, sun, antialiased=antialiased))
         dr.eval(output.features, output.alpha)
 
 
 def main() -> None:
     parser = common.arguments(__doc__, "sizes", "repeats")
     parser.add_argument("--methods", default="relight,shadow-map,shadow-splat", help=f"of {', '.join(LIT)}")
-    parser.add_argument("--preset", default="thesis", help="whose networks and light images (default thesis)")
+    parser.add_argument(
+        "--preset", default="thesis", help="whose networks, light images and supersampling (default thesis)"
+    )
     parser.add_argument("--step-sizes", metavar="SIZES", help="of the training steps; 'none' leaves them out")
     options = parser.parse_args()
     name = backend.select(options.backend)
@@ -114,10 +127,10 @@ def measure_step(count: int, pixels: int, method: str, options: Any) -> common.R
     with tempfile.TemporaryDirectory() as folder:
         data = synthetic.write_dataset(Path(folder) / "data", count, pixels)
         lit = [replace(frame, sun=Sun(SUNS[i])) for i, frame in enumerate(data.train)]
-        light = preset(options.preset, method).light
-        assert light is not None
-        arrays = lit_arrays(count, light.features)
-        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, arrays, light=light)
+        config = preset(options.preset, method)
+        assert config.light is not None
+        arrays = lit_arrays(count, config.light.features)
+        trainer = synthetic.still_trainer(replace(data, train=tuple(lit)), count, arrays, config)
         clock = common.interleaved({"step": lambda: dr.eval(trainer.step())}, options.repeats)["step"]
         sums = common.kernels(lambda: dr.eval(trainer.step()))
     return {"Gaussians": count, "pixels": pixels, "method": method, "step (quartiles)": str(clock)} | {

@@ -1,5 +1,6 @@
 """A data set for the benchmarks: pictures of a sphere of splats by our own rasterizer, and a trainer on it."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,20 +49,25 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
     return read_dataset(root)
 
 
-def still_trainer(dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None, **options: Any) -> Trainer:
-    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on.
+def still_trainer(
+    dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None, base: TrainConfig | None = None
+) -> Trainer:
+    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on, on
+    pictures of full size.
 
     It holds the splats in `arrays`, or starts from the `count` points: opacity 0.1, as wide as their spacing.
-    options: more of `TrainConfig`
+    base: whose other settings count, by default those of `TrainConfig`
     """
-    config = TrainConfig(
+    config = replace(
+        base or TrainConfig(),
         iterations=NEVER,
         init="points",
         init_count=count,
+        splatfacto_start=False,
         sh_every=1,
+        num_downscales=0,
         rates=STILL,
         refinement=DensificationConfig(refine_start=NEVER, refine_stop=NEVER, max_gaussians=count),
-        **options,
     )
     trainer = Trainer(dataset, config)
     if arrays is not None:

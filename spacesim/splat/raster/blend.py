@@ -37,7 +37,6 @@ from spacesim.splat.raster.walks import Walks, are_in_parts, in_parts, whole_lis
 
 BUCKET = 8  #: pairs of a bucket, a power of two, some turns; 4 keep twice as much for 1 % of a step, 16 took longer
 TURN = {"cuda": 4, "llvm": 1}  #: pairs a turn of the blending loop: their numbers are read at once
-NOTHING = -1e30  #: logarithm of the opacity of what does not show
 SIGN = 2**31  #: bit of a number that says that it is negative
 CHECKPOINT_BYTES = 2**32  #: longer lists than these hold have their adjoint by tiles, on CUDA too
 
@@ -144,12 +143,11 @@ def _walk(
             snapshots.keep(k, transmittance, sums)
         transmittance, last, sums = list(transmittance), list(last), [list(pixel) for pixel in sums]
         for u in range(turn):
-            record = records.load(lists, dr.minimum(k + u, end - 1) if u else k)
-            if u:
-                record[5] = dr.select(k + u < end, record[5], NOTHING)
+            listed = k + u < end if u else ad.Bool(True)
+            record = records.load(lists, k + u, listed)
             powers = exponents(record, thread.x, thread.y, shape)
             for p in range(shape.pixels):
-                shows = powers[p] >= POWER_MIN
+                shows = listed & (powers[p] >= POWER_MIN)
                 weight = dr.minimum(exp2(powers[p]), ALPHA_MAX) * transmittance[p]
                 behind = transmittance[p] - weight  # negative where the pixel is finished: it blends nothing more
                 blends = shows & ((behind > TRANSMITTANCE_MIN) | ~walks.finishes[p])
