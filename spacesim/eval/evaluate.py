@@ -18,10 +18,10 @@ import numpy as np
 
 from spacesim.data import density
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, remove_leftovers, write_json
+from spacesim.data.files import JsonDict, write_json
 from spacesim.data.geometry import Array
 from spacesim.data.identity import frame_names, frames_digest
-from spacesim.data.integrity.outputs import check_evaluation_folder, clear_evaluation
+from spacesim.data.integrity.outputs import check_evaluation_folder, clear_evaluation, replaced_content
 from spacesim.data.integrity.whole import check_pictures
 from spacesim.data.records import Dataset, Frame
 from spacesim.data.transforms import check_still
@@ -94,7 +94,7 @@ def evaluate(
     progress: EvaluationProgress | None = None,
 ) -> JsonDict:
     """Evaluate every frame of the split and return what EVAL/metrics.json, written last, then holds. What an earlier
-    evaluation has left in the folder goes.
+    evaluation has left in the folder goes when this one is complete.
 
     What a run does not know of a picture (`splat.fit.find_unknowns`) is fitted on one half of it and scored on the
     other.
@@ -123,90 +123,91 @@ def evaluate(
         )
     network, lpips_sentence = lpips.load(config.lpips_weights)
     check_pictures(dataset, frames)
-    _prepare(out)
-    if dark is None or not run.relightable:
-        run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
-    models = [part.name for part in run.parts] or None  # of a composed scene, which was not trained on this dataset
-    own = config.align or dataset
-    known = training_frames(run.config, own) if models is None else TrainedOn((), MODELS_OF_A_SCENE)
-    trained = known.frames
-    other_data = explain_other_data(known.other, config.align.root if config.align else None)
-    if alignment:
-        trained = [moved_frame(frame, alignment.pose) for frame in trained]
-    objects = object_names(dataset, models or ())
-    knows_sun = known_suns(frames, trained)
-    comparison = MaterialComparison(run, dataset, frames)
-    results: list[FrameResult] = []
-    for name, frame, has_known_sun in zip(frame_names(frames), frames, knows_sun, strict=True):
+    _check_folder(out)
+    with replaced_content(out, clear_evaluation) as part:
+        if dark is None or not run.relightable:
+            run.predict(frames[0].camera, frames[0].sun)  # compiles the kernels
+        models = [part.name for part in run.parts] or None  # of a composed scene, which was not trained on this dataset
+        own = config.align or dataset
+        known = training_frames(run.config, own) if models is None else TrainedOn((), MODELS_OF_A_SCENE)
+        trained = known.frames
+        other_data = explain_other_data(known.other, config.align.root if config.align else None)
+        if alignment:
+            trained = [moved_frame(frame, alignment.pose) for frame in trained]
+        objects = object_names(dataset, models or ())
+        knows_sun = known_suns(frames, trained)
+        comparison = MaterialComparison(run, dataset, frames)
+        results: list[FrameResult] = []
+        for name, frame, has_known_sun in zip(frame_names(frames), frames, knows_sun, strict=True):
+            if progress:
+                progress(len(results), len(frames), frame.file_path)
+            folder = part / "frames" / name
+            results.append(
+                _evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns, comparison)
+            )
+        folders = [part / "frames" / result.record["name"] for result in results]
+        materials = comparison.scores(folders)
+        for result, values in zip(results, materials.records, strict=True):
+            result.record["material"] = values
+        no_map = _write_camera_density(dataset, trained, part)
+        sweep, no_sweep = write_sweep(run, dataset, frames, trained, part)
         if progress:
-            progress(len(results), len(frames), frame.file_path)
-        folder = out / "frames" / name
-        results.append(
-            _evaluate_frame(run, dataset, frame, has_known_sun, network, folder, objects, unknowns, comparison)
-        )
-    folders = [out / "frames" / result.record["name"] for result in results]
-    materials = comparison.scores(folders)
-    for result, values in zip(results, materials.records, strict=True):
-        result.record["material"] = values
-    no_map = _write_camera_density(dataset, trained, out)
-    sweep, no_sweep = write_sweep(run, dataset, frames, trained, out)
-    if progress:
-        progress(len(frames), len(frames), "its shape" if config.geometry else "")
-    shape, shapes = _evaluate_shapes(run, dataset, objects, config.geometry)
-    write_shapes(out / "geometry", shape)
+            progress(len(frames), len(frames), "its shape" if config.geometry else "")
+        shape, shapes = _evaluate_shapes(run, dataset, objects, config.geometry)
+        write_shapes(part / "geometry", shape)
 
-    method = str(run.config.get("method"))
-    records = [result.record for result in results]
-    ignored = statistics.fmean(result.ignored for result in results)
-    region = "frame" if all(result.source == "frame" for result in results) else "silhouette"
-    metrics = {
-        "schema": SCHEMA,
-        "run": str(run.path),
-        "data": str(dataset.root),
-        "split": config.split,
-        "model": {
-            "gaussians": run.gaussian_count,
-            "bytes": run.model_bytes,
-            "render_ms": 1e3 * statistics.median(result.seconds for result in results),
-            "backend": run.backend,
-        },
-        "image_region": region,
-        "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
-        "alignment": alignment.to_json() if alignment else None,
-        **_summaries(results),
-        "material": summary(materials.records),
-        "albedo_scale": materials.scale,
-        "geometry": shape.values,
-        "objects": _by_object(results, objects, shapes),
-        "known_suns": _sun_group([result for result in results if result.has_known_sun is True]),
-        "unseen_suns": _sun_group([result for result in results if result.has_known_sun is False]),
-        "relight": sweep,
-        "notes": [
-            *([alignment.note] if alignment else []),
-            *other_data,
-            *explain_fit(unknowns, records, region == "frame"),
-            *([shape.note] if shape.note else []),
-            *materials.notes,
-            *([no_map] if no_map else []),
-            *explain_ignored(ignored),
-            *explain_sensor(dataset.scene),
-            *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
-            *explain_light(
-                [result.has_known_sun for result in results],
-                any(result.grazing is not None for result in results),
-                no_sweep,
-                known.why_unknown,
-            ),
-            *explain_objects(objects, records, models, swapped_order(run, dataset)),
-        ],
-        "dataset": _describe(dataset, frames, ignored),
-        "config": dict(run.config),
-        "training": dict(run.training),
-        "versions": _versions(),
-        "frames": [_flatten(record) for record in records],
-    }
-    write_json(out / "metrics.json", metrics := _without_nan(metrics))
-    return metrics
+        method = str(run.config.get("method"))
+        records = [result.record for result in results]
+        ignored = statistics.fmean(result.ignored for result in results)
+        region = "frame" if all(result.source == "frame" for result in results) else "silhouette"
+        metrics = {
+            "schema": SCHEMA,
+            "run": str(run.path),
+            "data": str(dataset.root),
+            "split": config.split,
+            "model": {
+                "gaussians": run.gaussian_count,
+                "bytes": run.model_bytes,
+                "render_ms": 1e3 * statistics.median(result.seconds for result in results),
+                "backend": run.backend,
+            },
+            "image_region": region,
+            "fitted": [{"name": unknown.name, "how": unknown.how} for unknown in unknowns] or None,
+            "alignment": alignment.to_json() if alignment else None,
+            **_summaries(results),
+            "material": summary(materials.records),
+            "albedo_scale": materials.scale,
+            "geometry": shape.values,
+            "objects": _by_object(results, objects, shapes),
+            "known_suns": _sun_group([result for result in results if result.has_known_sun is True]),
+            "unseen_suns": _sun_group([result for result in results if result.has_known_sun is False]),
+            "relight": sweep,
+            "notes": [
+                *([alignment.note] if alignment else []),
+                *other_data,
+                *explain_fit(unknowns, records, region == "frame"),
+                *([shape.note] if shape.note else []),
+                *materials.notes,
+                *([no_map] if no_map else []),
+                *explain_ignored(ignored),
+                *explain_sensor(dataset.scene),
+                *explain(records, [result.source for result in results], None if network else lpips_sentence, method),
+                *explain_light(
+                    [result.has_known_sun for result in results],
+                    any(result.grazing is not None for result in results),
+                    no_sweep,
+                    known.why_unknown,
+                ),
+                *explain_objects(objects, records, models, swapped_order(run, dataset)),
+            ],
+            "dataset": _describe(dataset, frames, ignored),
+            "config": dict(run.config),
+            "training": dict(run.training),
+            "versions": _versions(),
+            "frames": [_flatten(record) for record in records],
+        }
+        write_json(part / "metrics.json", metrics := _without_nan(metrics))
+        return metrics
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,17 +315,11 @@ def _sun_group(results: Sequence[FrameResult]) -> JsonDict | None:
     return {"frames": len(results), "suns": count_suns([result.frame for result in results]), **_summaries(results)}
 
 
-def _prepare(out: Path) -> None:
-    """Make the folder and take away what an earlier evaluation has left in it."""
+def _check_folder(out: Path) -> None:
+    """Raise InputError where no evaluation may be written into a folder."""
     if (out / "transforms.json").exists() or (out / "config.json").exists():
         raise InputError(f"{out}: expected a folder for an evaluation, found a dataset or a run")
     check_evaluation_folder(out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        clear_evaluation(out)
-        remove_leftovers(out)
-    except OSError as error:
-        raise InputError(f"{out}: expected a folder to write to ({error.strerror})") from None
 
 
 def summary(records: Iterable[Mapping[str, float | None] | None]) -> JsonDict | None:

@@ -185,7 +185,7 @@ def test_a_folder_with_another_report_is_refused_and_left_alone(make_run, datase
     assert {str(path.relative_to(out)): path.read_text() for path in out.rglob("*.*")} == files
 
 
-def test_an_evaluation_that_was_interrupted_is_done_again_beside_notes(make_run, dataset, tmp_path):
+def test_an_interrupted_evaluation_leaves_the_one_before_it(make_run, dataset, tmp_path):
     out = tmp_path / "eval"
     out.mkdir()
     (out / "log.txt").write_text("mine")
@@ -195,12 +195,24 @@ def test_an_evaluation_that_was_interrupted_is_done_again_beside_notes(make_run,
         if done == 1:
             raise KeyboardInterrupt
 
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
     with pytest.raises(KeyboardInterrupt):
-        evaluate(make_run(shifted), dataset, out, progress=stop)
-    assert not (out / "metrics.json").exists()
-    evaluate(make_run(shifted), dataset, out)
-    assert (out / "metrics.json").exists()
+        evaluate(make_run(), dataset, out, progress=stop)
+    assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
+    evaluate(make_run(), dataset, out)
     assert (out / "log.txt").read_text() == "mine"
+    assert (out / "metrics.json").read_bytes() != before[out / "metrics.json"]
+
+
+def test_two_evaluations_into_one_folder_keep_out_of_each_others_way(make_run, dataset, tmp_path):
+    out = tmp_path / "eval"
+
+    def another(_done: int, _all: int, _file: str) -> None:
+        with pytest.raises(InputError, match="eval: expected no other run at work in the folder, found one"):
+            evaluate(make_run(), dataset, out)
+
+    evaluate(make_run(shifted), dataset, out, progress=another)
+    assert (out / "metrics.json").exists()
 
 
 def test_a_broken_picture_is_found_before_an_earlier_evaluation_goes(make_run, dataset, tmp_path):
@@ -342,11 +354,16 @@ def test_a_frame_without_a_sun_is_named(relightable, tmp_path):
         evaluate(run, lacking, tmp_path / "eval")
 
 
-def test_old_numbers_do_not_outlive_new_pictures(make_run, dataset, tmp_path):
-    evaluate(make_run(), dataset, tmp_path / "eval")
+def test_a_failed_evaluation_leaves_the_pictures_and_numbers_of_the_one_before(make_run, dataset, tmp_path):
+    out = tmp_path / "eval"
+    evaluate(make_run(), dataset, out)
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
     with pytest.raises(WorkError):
-        evaluate(make_run(lambda rgb: rgb + np.inf), dataset, tmp_path / "eval")
-    assert not (tmp_path / "eval" / "metrics.json").exists()
+        evaluate(make_run(lambda rgb: rgb + np.inf), dataset, out)
+    assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
+    with pytest.raises(WorkError):
+        evaluate(make_run(lambda rgb: rgb + np.inf), dataset, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_out_is_a_file(make_run, dataset, tmp_path):

@@ -1,8 +1,7 @@
 """What every exporter needs of a dataset: the objects with their poses and meshes, and opaque pictures."""
 
-import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,11 +12,9 @@ from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.images.tone import TONES, as_bytes, display_values
-from spacesim.data.lock import lock_folder
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.mesh import MAX_COORDINATE, check_points, load_mesh
 from spacesim.data.records import Camera, Dataset, Frame
-
-PART = ".part"  #: hidden, in a folder that is being written
 
 ExportProgress = Callable[[int, int, str], None]  #: frames done, frames in all, name of the frame
 
@@ -159,22 +156,9 @@ def frame_camera(frame: Frame) -> dict[str, float | list[float]]:
     return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "distortion": lens}
 
 
-@contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
-    """Where to write what `out`, which must be new or empty, holds when the `with` block ends; nothing of a block that
-    raises. Raises InputError for another `out`, and where another process writes into it."""
+def new_folder(out: Path) -> AbstractContextManager[Path]:
+    """Where to write what `out`, which must be new or empty, holds in the end, see `replaced_content`."""
     out = Path(out)
     if out.exists() and (not out.is_dir() or holds_files(out)):
         raise InputError(f"{out}: expected a new or empty folder, found a file or files in it")
-    was_there, part = out.exists(), out / PART
-    with lock_folder(out):
-        try:
-            shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
-            yield part
-            for path in sorted(part.iterdir()):
-                path.replace(out / path.name)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-            if not was_there:
-                with suppress(OSError):  # it is not empty
-                    out.rmdir()
+    return replaced_content(out)

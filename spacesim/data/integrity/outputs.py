@@ -2,14 +2,16 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, read_json
+from spacesim.data.files import MAX_LIST_BYTES, read_json, remove_leftovers
 from spacesim.data.integrity.manifest import NAME as DIGESTS
 from spacesim.data.integrity.manifest import read_manifest
+from spacesim.data.lock import lock_folder
 
 SUFFIXES = {
     "ply": (".ply",),
@@ -24,6 +26,8 @@ SUFFIXES = {
     "poses": (".json",),
 }
 """{kind of file: suffixes of its names}."""
+
+PART = ".part"  #: hidden, in a folder that is being written
 
 _RUN = re.compile(
     r"(config|training|cameras)\.json|(model|poses)\.safetensors|checkpoints/(step_\d+\.safetensors|seconds\.json)"
@@ -109,6 +113,7 @@ def clear_evaluation(out: Path) -> None:
     """Take away all that an evaluation has written into a folder, its numbers before the pictures: a folder that has
     these is complete. Raises OSError where that fails."""
     _remove(out, _EVALUATION, ("report.html", "metrics.json"))
+    remove_leftovers(out)
 
 
 def check_sweep_folder(out: Path) -> None:
@@ -127,6 +132,49 @@ def check_sweep_folder(out: Path) -> None:
 def clear_sweep(out: Path) -> None:
     """Take away all that a sweep has written into a folder. Raises OSError where that fails."""
     _remove(out, _SWEEP)
+
+
+@contextmanager
+def replaced_content(out: Path, clear: Callable[[Path], None] | None = None) -> Iterator[Path]:
+    """A hidden folder in `out` to write into. When the `with` block ends, what it holds takes the place of what `clear`
+    takes away from `out`; where the block raises, `out` is as it was before. Raises InputError where it cannot be
+    written, and where another process is writing into it."""
+    out = Path(out)
+    was_there, part = out.exists(), out / PART
+    with lock_folder(out):
+        try:
+            with _written(out):
+                if part.exists():  # of a process that was killed
+                    shutil.rmtree(part)
+                part.mkdir(parents=True)
+            yield part
+            with _written(out):
+                if clear is not None:
+                    clear(out)
+                _move_content(part, out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+            if not was_there:
+                with suppress(OSError):  # it is not empty
+                    out.rmdir()
+
+
+@contextmanager
+def _written(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{folder}: expected a folder that can be written ({error.strerror})") from None
+
+
+def _move_content(source: Path, target: Path) -> None:
+    """All that is in `source` into `target`, files last, as they say that the rest is there."""
+    for path in sorted(source.iterdir(), key=lambda path: (path.is_file(), path.name)):
+        place = target / path.name
+        if path.is_dir() and place.is_dir():
+            _move_content(path, place)
+        else:
+            path.replace(place)
 
 
 def _files(folder: Path) -> Iterator[str]:

@@ -28,7 +28,7 @@ from spacesim.data.images.sheet import (
     font,
 )
 from spacesim.data.images.tone import as_bytes
-from spacesim.data.integrity.outputs import check_sweep_folder, clear_sweep
+from spacesim.data.integrity.outputs import check_sweep_folder, clear_sweep, replaced_content
 from spacesim.data.records import MAX_SIDE, Camera, Sun, check_size
 from spacesim.learning.pictures import shadow_colors
 from spacesim.splat.export.video import INSTALL, Video, encoder
@@ -110,7 +110,8 @@ def sweep(
     kind: "rgb", over black, or "shadow": how much of the Sun is seen, from SHADOWED to LIT;  keep_frames: write every
     picture, too;  report: called with (pictures done, of all);  exposure: EV, see `Run.predict`
     Raises InputError for another kind, a run that no Sun relights, a run without shadows where these are asked for, an
-    exposure of one whose colours are sRGB values, a folder that cannot be made or holds other files.
+    exposure of one whose colours are sRGB values, a folder that cannot be made or holds other files. The files of an
+    earlier sweep go when these are complete.
     """
     out = Path(out)
     if kind not in KINDS:
@@ -126,28 +127,29 @@ def sweep(
     check_sweep_folder(out)
     video = _SweepVideo(camera) if encoder() else None
     first = _picture(run, camera, suns[0], kind, exposure)  # what does not fit the run shows before there is a folder
-    _make_folder(out)
     count = min(MAX_TILES, len(suns))
     shown = {k * len(suns) // count for k in range(count)}
     tiles = []
-    for k, sun in enumerate(suns):
-        picture, light = first if k == 0 else _picture(run, camera, sun, kind, exposure)
-        if keep_frames:
-            write_png(out / FRAMES_NAME / f"{k:04d}.png", picture, durable=False)
-            if light is not None:
-                write_exr(out / FRAMES_NAME / f"{k:04d}.exr", {"linear": light}, durable=False)
+    with replaced_content(out, clear_sweep) as part:
+        for k, sun in enumerate(suns):
+            picture, light = first if k == 0 else _picture(run, camera, sun, kind, exposure)
+            if keep_frames:
+                write_png(part / FRAMES_NAME / f"{k:04d}.png", picture, durable=False)
+                if light is not None:
+                    write_exr(part / FRAMES_NAME / f"{k:04d}.exr", {"linear": light}, durable=False)
+            if video is not None:
+                video.add(picture, sun)
+            if k in shown:
+                tiles.append(_tile(picture, sun))
+            if report is not None:
+                report(k + 1, len(suns))
+        write_png(part / SHEET_NAME, _sheet(run, camera, suns, kind, tiles))
         if video is not None:
-            video.add(picture, sun)
-        if k in shown:
-            tiles.append(_tile(picture, sun))
-        if report is not None:
-            report(k + 1, len(suns))
-    write_png(out / SHEET_NAME, _sheet(run, camera, suns, kind, tiles))
+            write_bytes(part / VIDEO_NAME, video.video.content())
     if video is None:
         return SweepFiles(
             out / SHEET_NAME, None, f"{out / VIDEO_NAME}: not written, PyAV is not installed; type: {INSTALL}"
         )
-    write_bytes(out / VIDEO_NAME, video.video.content())
     return SweepFiles(out / SHEET_NAME, out / VIDEO_NAME, None)
 
 
@@ -167,15 +169,6 @@ def sky_mark(sun: Sun, side: int = LABEL_HEIGHT - 4) -> np.ndarray:
     box = [x - dot, y - dot, x + dot, y + dot]
     draw.ellipse(box, SUN if elevation >= 0 else DARK_PAGE.paper, SUN, width=10)
     return np.asarray(picture.resize((side, side), Image.Resampling.BOX))
-
-
-def _make_folder(out: Path) -> None:
-    """Before most of the work, not after it; without what an earlier sweep has left there."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        clear_sweep(out)
-    except OSError as error:
-        raise InputError(f"{out}: expected a folder that can be written ({error.strerror})") from None
 
 
 def _picture(

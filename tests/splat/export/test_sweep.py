@@ -186,6 +186,22 @@ def test_an_earlier_sweep_is_replaced(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.rglob("*")] == ["sweep.png"]
 
 
+def test_an_interrupted_sweep_leaves_the_one_before_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "encoder", lambda: None)
+    sweep(Lit(), CAMERA, suns_around(3), tmp_path, keep_frames=True)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+
+    def stop(done: int, _count: int) -> None:
+        with pytest.raises(InputError, match="expected no other run at work in the folder"):
+            sweep(Lit(), CAMERA, suns_around(2), tmp_path)
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(Lit(), CAMERA, suns_around(5), tmp_path, report=stop)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
 @pytest.mark.parametrize("name", ["frames/0001.png", "transforms.json", "frames/mine.txt"])
 def test_a_folder_with_frames_of_others_is_refused_and_left_alone(name, tmp_path):
     """Also beside an earlier sweep's sheet."""
