@@ -26,6 +26,7 @@ from spacesim.splat.run import load_run
 from spacesim.splat.train.checkpoint import read_tensors, write_tensors
 from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.train import train
+from spacesim.splat.train.trainer import Trainer
 
 CONFIG = TrainConfig(preset="demo", iterations=40, init_count=200, checkpoint_every=10, sh_every=20)
 FEW = ("--preset", "demo", "--iterations", "8", "--set", "init_count=100")
@@ -623,6 +624,53 @@ def test_a_model_that_is_not_finite_is_refused(spacesim, tiny_run, tmp_path):
     write_tensors(run / "model.safetensors", {**tensors, "means": np.full_like(tensors["means"], np.nan)}, header)
     refused = spacesim("export", run, "--ply", tmp_path / "a.ply")
     assert refused.is_refusal(run / "model.safetensors"), refused
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.99])
+def test_a_byte_that_has_changed_in_a_model_is_found(spacesim, tiny_run, tmp_path, part):
+    run = Path(shutil.copytree(tiny_run, tmp_path / "run"))
+    model = run / "model.safetensors"
+    content = bytearray(model.read_bytes())
+    start = 8 + int.from_bytes(content[:8], "little")  # of the numbers
+    content[start + int(part * (len(content) - start))] ^= 1
+    model.write_bytes(content)
+    refused = spacesim("export", run, "--ply", tmp_path / "a.ply")
+    assert refused.is_refusal(model, "some have changed since"), refused
+
+
+def test_a_digit_that_has_changed_in_a_header_is_found(tmp_path):
+    path = tmp_path / "a.safetensors"
+    write_tensors(path, {"values": np.ones(3, np.float32)}, {"iteration": 41})
+    assert read_tensors(path)[1]["iteration"] == 41
+    path.write_bytes(path.read_bytes().replace(b": 41", b": 42"))
+    with pytest.raises(InputError, match="some have changed since"):
+        read_tensors(path)
+    header = json.dumps({"format": "spacesim-gaussians-1", "iteration": 1})
+    path.write_bytes(save({"values": np.ones(3, np.float32)}, {"spacesim": header}))  # as older versions wrote it
+    assert read_tensors(path)[1]["iteration"] == 1
+
+
+def test_a_model_that_becomes_infinite_stops_and_keeps_the_last_checkpoint(tiny_data, tmp_path):
+    """Where no loss shows it: a Gaussian whose centre is no number is not drawn."""
+    dataset = read_dataset(tiny_data)
+
+    def broken(path: Path) -> None:
+        checkpoint = max((path / "checkpoints").glob("*.safetensors"))
+        tensors, header = read_tensors(checkpoint)
+        tensors["means"][0, 0] = np.nan
+        write_tensors(checkpoint, tensors, header)
+
+    kill(TRAINING, 5, True, tiny_data, tmp_path / "run")
+    broken(tmp_path / "run")
+    with pytest.raises(InputError, match="expected finite numbers as means, found others; without this file training"):
+        train(dataset, tmp_path / "run", CONFIG, resume=True)
+    trainer = Trainer(dataset, replace(CONFIG, iterations=4))
+    trainer.gaussians.means[0][0] = np.nan
+    with pytest.raises(WorkError, match="means of the model are not finite at iteration 0; the last checkpoint"):
+        trainer.save(tmp_path / "step.safetensors")
+    with pytest.raises(WorkError, match="means of the model are not finite at iteration 4"):
+        trainer.complete(tmp_path / "other", lambda _progress: None)
+    assert not list(tmp_path.glob("other/*.safetensors"))
 
 
 def test_an_azimuth_below_zero(spacesim, tmp_path):

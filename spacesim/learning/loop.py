@@ -86,9 +86,10 @@ class TrainingLoop(ABC):
         return TimeLeft(self.config.iterations)
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint: everything that the next step depends on."""
+        """Write a checkpoint: everything that the next step depends on. Raises WorkError where the model is not
+        finite."""
         header = {"iteration": self.iteration, "history": self.history, **self.counts()}
-        write_tensors(path, {**self.model_tensors(), **self.state_tensors()}, header, self.form)
+        write_tensors(path, {**self._finite_model(), **self.state_tensors()}, header, self.form)
 
     def restore(self, path: Path) -> None:
         """Continue from what `save` wrote. Raises InputError where the file does not fit."""
@@ -105,6 +106,8 @@ class TrainingLoop(ABC):
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
         except ValueError as error:
             raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
+        if broken := _not_finite(self.model_tensors()):
+            raise InputError(f"{path}: expected finite numbers as {broken}, found others")
         self.iteration, self.history = header.iteration, [asdict(entry) for entry in header.history]
 
     def complete(self, out: Path, on_progress: Callable[[TrainingProgress], None], command: Sequence[str] = ()) -> None:
@@ -126,6 +129,7 @@ class TrainingLoop(ABC):
 
         with interrupts.defer_interrupts() as should_stop:  # the writing, too: the last steps may have no checkpoint
             self.run(on_progress, checkpoint, should_stop)
+            model = self._finite_model()
             write_json(
                 out / "training.json",
                 {
@@ -142,7 +146,7 @@ class TrainingLoop(ABC):
             for name, content in self.files().items():
                 write_json(out / name, content)
             header = {"iteration": self.iteration, "config": self.config.to_json()}
-            write_tensors(out / "model.safetensors", self.model_tensors(), header, self.form)
+            write_tensors(out / "model.safetensors", model, header, self.form)
 
     def run(
         self,
@@ -191,3 +195,16 @@ class TrainingLoop(ABC):
     def _check(self, loss: float) -> None:
         if not math.isfinite(loss):
             raise WorkError(f"training: the loss is {loss} at iteration {self.iteration}; the last checkpoint is kept")
+
+    def _finite_model(self) -> dict[str, np.ndarray]:
+        """`model_tensors`. Raises WorkError where some are not finite: what is not drawn is not seen in the loss."""
+        model = self.model_tensors()
+        if broken := _not_finite(model):
+            at = f"at iteration {self.iteration}; the last checkpoint is kept"
+            raise WorkError(f"training: {broken} of the model are not finite {at}")
+        return model
+
+
+def _not_finite(tensors: Mapping[str, np.ndarray]) -> str:
+    """The first that has a number that is not finite; "" where all are."""
+    return next((name for name, values in tensors.items() if not np.isfinite(values).all()), "")

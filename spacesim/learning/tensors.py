@@ -1,5 +1,6 @@
 """Named arrays in safetensors files with a JSON header, complete or not there."""
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -13,17 +14,21 @@ from spacesim.backend.memory import check_memory
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonDict, JsonMapping, open_regular, write_bytes
 
+DIGEST = "sha256"  #: its name in a header
+
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: JsonMapping, form: str) -> None:
-    """Write named arrays and a JSON header to `path`, atomically. form: the word by which `read_tensors` knows it."""
-    metadata = {"spacesim": json.dumps({"format": form, **header}, sort_keys=True)}
+    """Write named arrays and a JSON header to `path`, atomically, and a digest of both. form: the word by which
+    `read_tensors` knows it."""
     contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    write_bytes(path, save(contiguous, metadata=metadata))
+    known: JsonDict = {"format": form, **header}
+    text = json.dumps({**known, DIGEST: _digest(known, contiguous)}, sort_keys=True)
+    write_bytes(path, save(contiguous, metadata={"spacesim": text}))  # of two entries the order would be any
 
 
 def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], JsonDict]:
-    """(arrays, header) of a file that `write_tensors` wrote. Raises InputError for anything else, and for arrays of
-    other numbers than floating-point ones."""
+    """(arrays, header) of a file that `write_tensors` wrote. Raises InputError for anything else, for arrays of
+    other numbers than floating-point ones, and where a byte has changed since."""
     with open_regular(path, "a model") as file:
         check_memory(os.fstat(file.fileno()).st_size, f"{path}: reading it")
     try:
@@ -38,4 +43,17 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], JsonDict
     for name, tensor in tensors.items():
         if tensor.dtype not in (np.float32, np.float64):
             raise InputError(f"{path}: expected floating-point numbers as {name}, found {tensor.dtype}")
+    written = header.pop(DIGEST, None)  # files of older versions have none
+    if written is not None and written != _digest(header, tensors):
+        raise InputError(f"{path}: expected the bytes that were written, found that some have changed since (SHA-256)")
     return tensors, header
+
+
+def _digest(header: JsonMapping, tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of a header and of named arrays, contiguous ones."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        digest.update(f"\n{name} {value.dtype.str} {value.shape}\n".encode())
+        digest.update(value.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
