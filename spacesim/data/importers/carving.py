@@ -30,12 +30,14 @@ _VOTERS = 300  # pictures that decide the shape
 _SIDES = 48, 64, 96, 96  # voxels of the grid's side, round by round
 _CROP = 240  # pixels of the longer side at which pictures are looked at
 _LEAST = 4  # of its shorter side
+_ENLARGED = 3.0  # times, at most: what is done to outlines is meant for objects of a hundred pixels
 _MARGIN = 1.4  # times the object's radius: half the side of what is looked at
 _SHARES = 0.6, 0.75, 0.92, 0.95  # of the best voxels' votes, which others of the object get, too, round by round
 _ASKED = 0.4  # of these: what has less in one round is not asked about in the next
+_SEEN = 0.5  # of the votes that the most asked-about voxels can get: others get shares of as many, at least
 _PIECE = 0.02  # of the largest piece of the shape: smaller ones are no part of it
 _RARE = 5.0  # log-densities that a pixel of the object is rarer than the median of what surrounds it
-_DARK, _UNLIT = 0.08, 0.15  # luma of the brightest sky, and what it counts that the object is not seen before it
+_DARK, _UNLIT = 0.08, 0.2  # luma of the brightest sky, and what it counts that the object is not seen before it
 _REACH = 0.06  # of the object's size: how far colours move an outline
 
 
@@ -104,7 +106,7 @@ def find_shape(pictures: Sequence[PosedPicture], centre: Array, progress: Callab
                 got[inside] += (weights * votes)[place]
                 possible[inside] += weights[place]
             progress(number * len(voters) + k + 1, len(_SIDES) * len(voters))
-        grid.share[grid.asked] = got / possible
+        grid.share[grid.asked] = got / np.maximum(possible, _SEEN * np.quantile(possible, 0.9))
         before, shape = grid, grid.shape(_SHARES[number])
     return shape
 
@@ -172,10 +174,11 @@ def _look(picture: PosedPicture, shape: Shape) -> _View | None:
     if min(right - left, bottom - top) < _LEAST:
         return None
     image = Image.fromarray(over_black(read_png(picture.path)))
-    scale = min(1.0, _CROP / max(right - left, bottom - top))
+    scale = min(_ENLARGED, _CROP / max(right - left, bottom - top))
     size = max(_LEAST, round(scale * (right - left))), max(_LEAST, round(scale * (bottom - top)))
     box = left, top, right, bottom
-    return _View(luma_and_chroma(np.asarray(image.resize(size, Image.Resampling.BOX, box))), box, picture)
+    filter_ = Image.Resampling.BOX if scale < 1 else Image.Resampling.BILINEAR
+    return _View(luma_and_chroma(np.asarray(image.resize(size, filter_, box))), box, picture)
 
 
 def _vote(view: _View, shape: Shape) -> tuple[np.ndarray, np.ndarray]:

@@ -67,7 +67,10 @@ def published(tmp_path) -> Path:
                 x, y, z, w = Rotation.random(random_state=random).as_quat().tolist()
                 position = [0.1, -0.2, 2 + 0.5 * (k if name == "train" else 4 * k)]
                 labels.append({"filename": file, "q_vbs2tango_true": [w, x, y, z], "r_Vo2To_vbs_true": position})
-                pixels = random.integers(0, 255, SIZE[::-1]).astype(np.uint8)
+                pixels = random.integers(0, 40, SIZE[::-1]).astype(np.uint8)
+                column, row = (74.7 * position[i] / position[2] + (24, 15)[i] for i in (0, 1))
+                rows, columns = np.ogrid[: SIZE[1], : SIZE[0]]
+                pixels[np.hypot(columns - column, rows - row) < 74.7 * 0.5 / position[2]] += 200  # a ball of 0.5 m
                 PillowImage.fromarray(pixels).save(root / domain / "images" / file, quality=95)
             (root / domain / f"{name}.json").write_text(json.dumps(labels))
     return root
