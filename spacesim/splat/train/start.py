@@ -1,5 +1,7 @@
 """Where Gaussians start: on a mesh, at points, or at random."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from spacesim.backend import ad
@@ -21,6 +23,8 @@ MANY_PICTURES = 100  #: that unknown Suns are estimated from: 15 degrees off lik
 MANY_STEPS = 2_000  #: the same: after 800 they were off by 93 degrees, while halves of pictures agreed to 26
 LOOKED_AT = 32  #: training pictures, at most, that are looked at for whether the object is cut out
 CUT_AWAY = 0.02  #: least share of a picture's pixels that are empty or ignored, where the object is cut out
+BLACK, SKY = 0.05, 0.2  #: sRGB value of the brightest black sky, and its least share of a picture before it
+FEW_LEFT = 0.1  #: of the most Gaussians that training had: fewer at its end are told
 FEATURES = 0.3  #: standard deviation of the features at the start
 SOME_POINTS = 5_000  #: of a dataset, that say how near its cameras are
 CUT_OFF = 1e-3  #: share of the points before cameras that may be too near to be drawn
@@ -209,6 +213,35 @@ def sun_warning(dataset: Dataset, iterations: int) -> str:
         lacking.append("no silhouette, mask or alpha that separates the object from what is behind it")
     lack = " and ".join(lacking)
     return lack and f"{dataset.root}: expected enough to estimate unknown Suns, found {lack}: they may be far off"
+
+
+def sky_warning(dataset: Dataset) -> str:
+    """A sentence where the object stands before a black sky and is not cut out of most pictures: Gaussians then learn
+    the sky, as black things around the object; "" elsewhere."""
+    looked_at = dataset.train[:: -(-len(dataset.train) // LOOKED_AT)]
+    before_sky = sum(_is_before_sky(dataset, frame) for frame in looked_at)
+    if 2 * before_sky <= len(looked_at):
+        return ""
+    return (
+        f"{dataset.root}: expected the object cut out of its black sky, found no alpha, silhouettes or masks: training "
+        "takes the sky for black things around it and loses some dB; spacesim import with --masks auto cuts it out"
+    )
+
+
+def few_left_warning(history: Sequence[Mapping[str, float]]) -> str:
+    """A sentence where most Gaussians are gone at the end of training, by its history; "" where they are not."""
+    counts = [int(entry["gaussians"]) for entry in history]
+    if not counts or counts[-1] >= FEW_LEFT * max(counts):
+        return ""
+    return (
+        f"{counts[-1]} Gaussians are left of {max(counts)}: most were pruned before they learned where the object is; "
+        "take more iterations, a warm start, or points or a mesh to start from"
+    )
+
+
+def _is_before_sky(dataset: Dataset, frame: Frame) -> bool:
+    """Whether nothing separates the object from a black sky in a picture."""
+    return not _is_cut_out(dataset, frame) and bool((load_image(dataset, frame).rgb.max(axis=2) < BLACK).mean() > SKY)
 
 
 def _is_cut_out(dataset: Dataset, frame: Frame) -> bool:

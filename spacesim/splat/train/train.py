@@ -28,7 +28,13 @@ from spacesim.splat.train.config import TrainConfig
 from spacesim.splat.train.old_config import not_trained_any_more
 from spacesim.splat.train.pictures.poses import pose_config, pose_warning
 from spacesim.splat.train.pictures.suns import FirstSuns, check_pictures, first_suns, shape_config, surface_points
-from spacesim.splat.train.start import distance_warning, scale_warning, sun_warning
+from spacesim.splat.train.start import (
+    distance_warning,
+    few_left_warning,
+    scale_warning,
+    sky_warning,
+    sun_warning,
+)
 from spacesim.splat.train.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -61,7 +67,8 @@ def train(
     elif config.sun == "unknown":
         check_pictures(dataset)
     of_sun = sun_warning(dataset, config.iterations) if config.sun == "unknown" else ""
-    for remark in filter(None, (of_sun, scale_warning(dataset), distance_warning(dataset))):
+    of_sky = "" if of_sun else sky_warning(dataset)
+    for remark in filter(None, (of_sun, of_sky, scale_warning(dataset), distance_warning(dataset))):
         log.warning(remark)
     with open_folder(out, described, resume, read_config):
         if config.sun == "unknown":
@@ -69,6 +76,8 @@ def train(
         elif config.refine_poses:
             trainer = _trainer_of_poses(dataset, config, out, on_progress)
         trainer.complete(out, on_progress, command)
+    if remark := few_left_warning(trainer.history):
+        log.warning(remark)
     return load_run(out)
 
 

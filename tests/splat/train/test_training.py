@@ -19,7 +19,8 @@ from splats import random_splats
 from spacesim.backend import ad, recordings
 from spacesim.cli import main
 from spacesim.data.errors import InputError, WorkError
-from spacesim.data.images import load_image
+from spacesim.data.images import load_image, write_png
+from spacesim.data.images.tone import as_bytes
 from spacesim.data.lock import lock_folder
 from spacesim.data.records import Camera
 from spacesim.data.store import read_points, write_points
@@ -37,12 +38,14 @@ from spacesim.splat.train.start import (
     COVER,
     RADIUS,
     distance_warning,
+    few_left_warning,
     gaussians_at,
     initial_gaussians,
     largest_scale,
     lay_flat,
     scale_warning,
     scene_scale,
+    sky_warning,
 )
 from spacesim.splat.train.strategies.control import DensificationConfig
 from spacesim.splat.train.strategies.mcmc import McmcConfig
@@ -417,6 +420,31 @@ def test_poses_far_from_the_origin_are_warned_of(small_dataset):
     assert "found it 1.2e+07 m away, where single precision has steps of 0.5 m" in distance_warning(
         placed(small_dataset, shift=7e6)
     )
+
+
+def test_a_black_sky_without_alpha_is_warned_of(small_dataset, tmp_path):
+    def shown(background: float, masks: bool = False) -> str:
+        frames = []
+        for frame in small_dataset.train:
+            pixels = load_image(small_dataset, frame).over(np.full(3, background))
+            name = Path(frame.file_path).name
+            write_png(tmp_path / name, as_bytes(pixels))
+            mask = small_dataset.root / frame.silhouette_path if masks else None
+            frames.append(replace(frame, file_path=name, silhouette_path=mask))
+        return sky_warning(replace(small_dataset, root=tmp_path, train=tuple(frames)))
+
+    assert sky_warning(small_dataset) == shown(0.3) == shown(0.0, masks=True) == ""
+    assert "cut out of its black sky, found no alpha, silhouettes or masks" in shown(0.0)
+
+
+def test_few_gaussians_at_the_end_are_warned_of():
+    def history(*counts: int) -> list[dict[str, float]]:
+        return [{"iteration": 50.0 * k, "loss": 0.1, "gaussians": count} for k, count in enumerate(counts)]
+
+    assert (
+        few_left_warning([]) == few_left_warning(history(8000, 300, 800)) == few_left_warning(history(50, 9000)) == ""
+    )
+    assert few_left_warning(history(8000, 4000, 799)).startswith("799 Gaussians are left of 8000")
 
 
 def test_ply_round_trip(finished, tmp_path):
