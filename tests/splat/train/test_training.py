@@ -426,11 +426,10 @@ def test_a_black_sky_without_alpha_is_warned_of(small_dataset, tmp_path):
     def shown(background: float, masks: bool = False) -> str:
         frames = []
         for frame in small_dataset.train:
-            pixels = load_image(small_dataset, frame).over(np.full(3, background))
-            name = Path(frame.file_path).name
-            write_png(tmp_path / name, as_bytes(pixels))
-            mask = small_dataset.root / frame.silhouette_path if masks else None
-            frames.append(replace(frame, file_path=name, silhouette_path=mask))
+            image, name = load_image(small_dataset, frame), Path(frame.file_path).name
+            write_png(tmp_path / name, as_bytes(image.over(np.full(3, background))))
+            write_png(tmp_path / f"mask_{name}", as_bytes(image.alpha))
+            frames.append(replace(frame, file_path=name, silhouette_path=f"mask_{name}" if masks else None))
         return sky_warning(replace(small_dataset, root=tmp_path, train=tuple(frames)))
 
     assert sky_warning(small_dataset) == shown(0.3) == shown(0.0, masks=True) == ""
