@@ -123,8 +123,8 @@ def generate(
         (docs/how-to/trajectory.md)
     options: of the scene, as the command line has them: suns, views (under each Sun), test_suns, test_views,
         sun=(azimuth, elevation) in degrees, a direction [3], a `Sun` or several, distance in metres, resolution=256 or
-        (width, height) in pixels, fov_deg, exposure (display value of a radiance of 1 W m^-2 sr^-1), spp (samples a
-        pixel), seed
+        (width, height) in pixels, fov_deg or focal=(fx, fy), principal=(cx, cy), exposure (display value of a
+        radiance of 1 W m^-2 sr^-1), spp (samples a pixel), seed; of a mesh file units and up; min_sunlit (share)
     progress: called with (frames done, frames in all, name of the frame last done)
 
     Raises InputError for a scene, an option or a folder that cannot be, WorkError where disk, memory or processes fail,

@@ -125,12 +125,12 @@ class Camera:
 
     @staticmethod
     def look_at(
-        position: ArrayLike,
-        target: ArrayLike,
+        position: "ArrayLike",
+        target: "ArrayLike",
         width: int,
         height: int,
         fov_x_deg: float,
-        up: ArrayLike = (0.0, 0.0, 1.0),
+        up: "ArrayLike" = (0.0, 0.0, 1.0),
     ) -> "Camera":
         """A camera at `position` [3] that looks at `target` [3], metres, its picture upright towards `up`; see
         `from_fov`. Raises InputError where both are one place, too."""

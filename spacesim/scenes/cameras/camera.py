@@ -14,7 +14,10 @@ from spacesim.scenes.cameras.sensor import SensorConfig
 from spacesim.scenes.lights.sun import EXPOSURE
 from spacesim.scenes.materials.spectra import WHITE_BALANCES
 
-MIN_FOV = 1e-3
+FOV_DEG = 30.0
+"""Of cameras that say nothing else, degrees."""
+
+MIN_FOV, MAX_FOV = 1e-3, 120.0
 """Degrees."""
 
 EXPOSURES = (1e-12, 1e12)
@@ -26,7 +29,9 @@ class CameraConfig:
     """A camera. Raises InputError for a value out of range."""
 
     resolution: tuple[int, int] = (256, 256)  #: (width, height), pixels
-    fov_deg: float = 30.0  #: angle that the width covers without distortion
+    fov_deg: float = FOV_DEG  #: angle that the width covers without distortion
+    focal: tuple[float, float] | None = None  #: (fx, fy) pixels, in place of `fov_deg`
+    principal: tuple[float, float] | None = None  #: (cx, cy) pixels from the upper left corner; None: the middle
     distortion: tuple[float, ...] = ()  #: Brown-Conrady k1, k2, p1, p2, k3 in OpenCV's order, () none
     exposure: float = EXPOSURE  #: display value of a radiance of 1 W m^-2 sr^-1
     tone: str = "srgb"  #: curve of the 8-bit image, "srgb" or "filmic"
@@ -37,8 +42,7 @@ class CameraConfig:
         width, height = self.resolution
         expect(min(width, height) >= 8, "resolution", "at least 8 pixels", min(width, height))
         check_size(width, height, "resolution")
-        fits = MIN_FOV <= self.fov_deg <= 120
-        expect(fits, "fov_deg", f"an angle from {MIN_FOV:g} to 120 degrees", self.fov_deg)
+        self._check_lens()
         expect(len(self.distortion) in (0, 5), "distortion", "k1, k2, p1, p2, k3", list(self.distortion))
         expect(all(map(math.isfinite, self.distortion)), "distortion", "finite numbers", list(self.distortion))
         least, most = EXPOSURES
@@ -53,45 +57,92 @@ class CameraConfig:
             if math.isfinite(folds):
                 raise InputError(f"distortion: expected a lens that is one-to-one over the image, found {lens}")
 
+    def _check_lens(self) -> None:
+        """Raise InputError where focal lengths and principal point are those of no picture."""
+        angles = f"an angle from {MIN_FOV:g} to {MAX_FOV:g} degrees"
+        expect(MIN_FOV <= self.fov_deg <= MAX_FOV, "fov_deg", angles, self.fov_deg)
+        if self.focal is not None:
+            if self.fov_deg != FOV_DEG:
+                raise InputError("focal: expected alone, found fov_deg beside it")
+            positive = all(math.isfinite(length) and length > 0 for length in self.focal)
+            expect(positive, "focal", "positive numbers of pixels", list(self.focal))
+        if self.principal is not None:
+            within = all(0 < place < side for place, side in zip(self.principal, self.resolution, strict=True))
+            expect(within, "principal", f"a point within {self.resolution} pixels", list(self.principal))
+        if self.focal is not None:
+            for low, high in self._sides:
+                across = math.degrees(math.atan(high) - math.atan(low))
+                if not MIN_FOV <= across <= MAX_FOV:
+                    raise InputError(f"focal: expected {angles} across the image, found {across:g} by {self.focal}")
+
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """fx and fy, pixels."""
+        if self.focal is not None:
+            return self.focal
+        length = 0.5 * self.resolution[0] / math.tan(0.5 * math.radians(self.fov_deg))
+        return length, length
+
+    @property
+    def _sides(self) -> list[tuple[float, float]]:
+        """Tangents, without distortion, of the angles from the axis to the left and right, upper and lower border."""
+        centre = self.principal or (0.5 * self.resolution[0], 0.5 * self.resolution[1])
+        return [
+            (-c / f, (side - c) / f) for c, f, side in zip(centre, self.focal_lengths, self.resolution, strict=True)
+        ]
+
     @property
     def half_tangents(self) -> tuple[float, float]:
-        """Tangents of half the angles that the width and the height cover, without distortion."""
-        width, height = self.resolution
-        half = math.tan(0.5 * math.radians(self.fov_deg))
-        return half, half * height / width
+        """Tangents of half the angles that the width and the height cover, without distortion; where the axis is not in
+        the middle, of the angles to the nearer borders."""
+        if self.focal is None and self.principal is None:
+            width, height = self.resolution
+            half = math.tan(0.5 * math.radians(self.fov_deg))
+            return half, half * height / width
+        across, down = (min(-low, high) for low, high in self._sides)
+        return across, down
 
     @property
     def smallest_fov(self) -> float:
-        """Radians that the shorter side of the image covers, without distortion."""
+        """Radians that the shorter side of the image covers, without distortion; where the axis is not in the middle,
+        twice those to the nearest border."""
         width, height = self.resolution
-        return math.radians(self.fov_deg) if width <= height else 2 * math.atan(self.half_tangents[1])
+        if self.focal is None and self.principal is None and width <= height:
+            return math.radians(self.fov_deg)
+        return 2 * math.atan(min(self.half_tangents))
 
     def at(self, world_from_camera: Array) -> Camera:
         """The pinhole camera at a pose [4, 4]."""
-        return Camera.from_fov(world_from_camera, *self.resolution, self.fov_deg)
+        width, height = self.resolution
+        if self.focal is None and self.principal is None:
+            return Camera.from_fov(world_from_camera, width, height, self.fov_deg)
+        centre = self.principal or (0.5 * width, 0.5 * height)
+        return Camera(world_from_camera, width, height, *self.focal_lengths, *centre)
 
     def _first_fold(self) -> float:
-        """Pixels from the image's centre to the nearest of its points that no ray, or more than one, reaches; infinity
+        """Pixels from the optical axis to the nearest of its points that no ray, or more than one, reaches; infinity
         where there is none.
 
-        Rays are followed from the centre outwards: the map is one-to-one up to where the determinant of its derivative
+        Rays are followed from there outwards: the map is one-to-one up to where the determinant of its derivative
         is no longer positive. The inverse that pictures are rendered with must find its way back, too.
         """
-        u, v = self.half_tangents
-        side = np.linspace(-1, 1, 33)
-        border = np.concatenate([[[s, e], [e, s]] for s in side for e in (-1.0, 1.0)]).T  # [2, 132], twice the corners
-        lines = border[:, :, None] * np.linspace(0, 4, 257)[1:] * np.array([u, v])[:, None, None]
+        low, high = np.array(self._sides).T
+        across, down = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 33)
+        rows = [np.stack([across, np.full(33, end)]) for end in (low[1], high[1])]
+        columns = [np.stack([np.full(33, end), down]) for end in (low[0], high[0])]
+        border = np.concatenate([*rows, *columns], axis=1)  # [2, 132], twice the corners
+        lines = border[:, :, None] * np.linspace(0, 4, 257)[1:]
         with np.errstate(all="ignore"):
             turned = ~(_determinant(lines, self.distortion) > 0)
             first = np.take_along_axis(lines, turned.argmax(axis=1)[None, :, None], axis=2)[..., 0]
             images = np.array(distort_points(first[0], first[1], self.distortion))
-            inside = turned.any(axis=1) & (np.abs(images) <= np.array([[u], [v]])).all(axis=0)
+            inside = turned.any(axis=1) & ((images >= low[:, None]) & (images <= high[:, None])).all(axis=0)
             points = lines[:, :, :64]
             x, y = undistort_points(points[0], points[1], self.distortion)
             back = np.array(distort_points(x, y, self.distortion))
             missed = ~(np.hypot(*(back - points)) <= 1e-6)
         folds = np.concatenate([np.hypot(*images)[inside], np.hypot(*points)[missed]])
-        return float(np.min(folds, initial=math.inf)) * 0.5 * self.resolution[0] / u
+        return float(np.min(folds, initial=math.inf)) * self.focal_lengths[0]
 
 
 def _determinant(points: Array, distortion: tuple[float, ...]) -> Array:

@@ -221,12 +221,12 @@ class PoseRig(Rig):
     Raises InputError for arrays of other shapes and for what no pose or Sun can be.
     """
 
-    world_from_camera: ArrayLike  #: [N, 4, 4]
-    sun: ArrayLike | Sun | Sequence[Sun] = SINGLE_SUN  #: one, or one for each pose
-    test: ArrayLike = ()  #: [M, 4, 4]
-    test_sun: ArrayLike | Sun | Sequence[Sun] | None = None  #: as `sun`
-    time: ArrayLike | None = None  #: [N] seconds
-    exposure: ArrayLike | None = None  #: [N]
+    world_from_camera: "ArrayLike"  #: [N, 4, 4]
+    sun: "ArrayLike | Sun | Sequence[Sun]" = SINGLE_SUN  #: one, or one for each pose
+    test: "ArrayLike" = ()  #: [M, 4, 4]
+    test_sun: "ArrayLike | Sun | Sequence[Sun] | None" = None  #: as `sun`
+    time: "ArrayLike | None" = None  #: [N] seconds
+    exposure: "ArrayLike | None" = None  #: [N]
 
     def __post_init__(self) -> None:
         if not len(self._poses("world_from_camera", self.world_from_camera)):
