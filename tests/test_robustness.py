@@ -18,6 +18,7 @@ from PIL import Image
 from safetensors.numpy import save
 from tiny import GENERATE, PROGRAM, PROGRESS, SPARING, contents, outcome
 
+from spacesim.backend import select
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.store import find_unreadable_files, load_truth, read_dataset, write_points
 from spacesim.scenes.generation.generate import generate
@@ -636,6 +637,27 @@ def test_a_byte_that_has_changed_in_a_model_is_found(spacesim, tiny_run, tmp_pat
     model.write_bytes(content)
     refused = spacesim("export", run, "--ply", tmp_path / "a.ply")
     assert refused.is_refusal(model, "some have changed since"), refused
+
+
+def test_a_mesh_is_not_written_to_what_says_no_form(spacesim, tiny_run):
+    assert spacesim("export", tiny_run, "--mesh", "/dev/null", "--views", "2").is_refusal("/dev/null", "says the form")
+
+
+def test_a_colmap_project_is_told_from_a_dataset(spacesim, tmp_path):
+    refused = spacesim("train", tmp_path, "--out", tmp_path / "run")
+    assert refused.is_refusal(tmp_path, "found none in it")
+    assert "COLMAP" not in refused.errors[0]
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    refused = spacesim("train", tmp_path, "--out", tmp_path / "run")
+    assert refused.is_refusal(tmp_path, "`spacesim import colmap` makes a dataset of a COLMAP project")
+
+
+@pytest.mark.parametrize(("options", "told"), [((), True), (("--preset", "fast"), False), (("--resume",), False)])
+def test_a_preset_that_takes_long_on_a_cpu_is_told(spacesim, tiny_data, tmp_path, monkeypatch, caplog, options, told):
+    monkeypatch.setattr("spacesim.cli.train.MANY", 3)
+    done = spacesim("train", tiny_data, "--out", tmp_path / "run", "--iterations", "3", *options)
+    assert done.code == 0, done.errors
+    assert ("on a CPU --preset demo is far quicker" in caplog.text) == (told and select() == "llvm")
 
 
 def test_a_digit_that_has_changed_in_a_header_is_found(tmp_path):

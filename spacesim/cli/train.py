@@ -1,15 +1,20 @@
 """`spacesim train`. Its options stand for fields of TrainConfig and NerfConfig, whose comments say what they mean."""
 
 import argparse
+import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from spacesim import interrupts
+from spacesim import backend, interrupts
 from spacesim.cli.parser import Parser
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonValue
+
+if TYPE_CHECKING:
+    from spacesim.learning.folder import TrainingProgress
 
 SUMMARY, NEEDS_BACKEND = "reconstruct a dataset with Gaussian splatting or a radiance field", True
 OPTIONS = {
@@ -29,6 +34,10 @@ _KEYS = {option: key for option, (key, _) in OPTIONS.items()} | {
     "--refine-poses": "refine_poses",
 }
 """{option: the field that it sets} of all."""
+
+log = logging.getLogger(__name__)
+
+MANY = 5_000  #: iterations that take long on a CPU
 
 _NAMES = ("method", "strategy", "preset")  #: of a configuration: `preset` makes it, with all its defaults
 
@@ -113,14 +122,31 @@ def run(options: argparse.Namespace) -> None:
         interrupts.print_output(listing(config))
         return
     dataset = read_dataset(options.data)
+    is_default = options.preset is None and begun is None
+    takes_long = is_default and config.iterations >= MANY and backend.select() == "llvm"
     with show_progress("train", "iterations") as report:
-        done = train(dataset, options.out, config, options.resume, report_training(report), options.arguments)
+        show = report_training(report)
+        if takes_long:
+            show = _telling(f"preset {config.preset} is made for a GPU; on a CPU --preset demo is far quicker", show)
+        done = train(dataset, options.out, config, options.resume, show, options.arguments)
     history, gaussians = done.training["history"], done.gaussian_count
     size = f"{done.training['parameters']} numbers" if gaussians is None else f"{gaussians} Gaussians"
     interrupts.print_output(
         f"{options.out}: {size} after {config.iterations} iterations in "
         f"{done.training['seconds']:.0f} s on {done.training['backend']}, final loss {history[-1]['loss']:.4f}"
     )
+
+
+def _telling(sentence: str, show: "Callable[[TrainingProgress], None]") -> "Callable[[TrainingProgress], None]":
+    """`show`, before whose first call a sentence is logged: what is refused says one alone."""
+    untold = [sentence]
+
+    def on_progress(state: "TrainingProgress") -> None:
+        while untold:
+            log.warning(untold.pop())
+        show(state)
+
+    return on_progress
 
 
 def _fields(config: type) -> set[str]:

@@ -29,10 +29,15 @@ class Earth:
     albedo: float = EARTH_ALBEDO  #: of the sphere, the same in all channels
 
     def __post_init__(self) -> None:
-        direction = np.asarray(self.direction, np.float64)
+        try:
+            direction = np.asarray(self.direction, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            direction = np.zeros(0)
         is_vector = direction.shape == (3,) and bool(np.isfinite(direction).all() and np.abs(direction).max() > 0)
         expect(is_vector, "earth_direction", "3 finite numbers, not all 0", self.direction)
         radius = self.angular_radius_deg
+        for name, value in (("angular_radius_deg", radius), ("albedo", self.albedo)):
+            expect(isinstance(value, int | float | np.number), f"earth_{name}", "a number", value)
         expect(0 < radius < 90, "earth_angular_radius_deg", "an angle from 0 to 90 degrees", radius)
         expect(0 <= self.albedo <= 1, "earth_albedo", "a fraction from 0 to 1", self.albedo)
         object.__setattr__(self, "direction", normalize(direction))

@@ -17,7 +17,7 @@ from spacesim.data.geometry import Array
 from spacesim.data.glb import TRIANGLES, write_glb
 from spacesim.data.images.color import linear_from_srgb
 from spacesim.data.images.png import png_bytes
-from spacesim.data.integrity.outputs import check_output
+from spacesim.data.integrity.outputs import SUFFIXES, check_output
 
 LEVELS = 256  #: of roughness and of metallic that a glTF texture tells apart; what is between them is read between
 READ = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
@@ -222,6 +222,8 @@ def write_mesh(
 
     path, suffix = Path(path), Path(path).suffix.lower()
     check_output(path, "mesh")
+    if suffix not in SUFFIXES["mesh"]:  # of a device, which may have any name
+        raise InputError(f"{path}: expected a name that ends in {' or '.join(SUFFIXES['mesh'])}, which says the form")
     if colors is not None and suffix == ".stl":
         raise InputError(f"{path}: expected a .glb, .obj or .ply, which hold colours, found STL")
     vertices = vertices @ np.array(UPRIGHT[up or ("y" if suffix == ".glb" else "z")]).T

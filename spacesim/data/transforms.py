@@ -186,7 +186,9 @@ def _say_what_is_missing(path: Path, root: Path) -> str:
         return f"{path}: expected a dataset folder or a transforms.json, found nothing"
     if (root / "scene.json").is_file():
         return f"{path}: expected transforms.json, found an unfinished one; generate with resume=True completes it"
-    return f"{path}: expected a dataset folder with a transforms.json, found none in it"
+    colmap = any((root / name).exists() for name in ("sparse", "database.db", "images.bin", "images.txt"))
+    hint = "; `spacesim import colmap` makes a dataset of a COLMAP project" if colmap else ""
+    return f"{path}: expected a dataset folder with a transforms.json, found none in it{hint}"
 
 
 def read_object(path: Path) -> Json:

@@ -154,6 +154,9 @@ class SceneConfig:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {**asdict(replace(self, folder=None, rig=FibonacciRig())), "rig": self.rig.to_json()}
         del values["folder"]
+        for name in ("focal", "principal"):
+            if values["camera"][name] is None:
+                del values["camera"][name]
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
         if self.background is None:
             del values["background"]
@@ -188,6 +191,8 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
         part = next((part for part, names in names_by_part.items() if name in names), None)
         if part is None:
             raise InputError(f"{name}: expected {_options_of(scene, name, names_by_part)}")
+        if name == "background" and not isinstance(value, str | BackgroundConfig | None):
+            raise InputError(f"background: expected words that say what is drawn, found {value!r:.60}")
         if value is not None:
             value = (value, value) if name == "resolution" and isinstance(value, int) else value
             value = _angles_of(value) if name == "sun" else value

@@ -48,6 +48,9 @@ def test_its_night_side_is_dark():
         ([1.0, 2.0], {}, "earth_direction"),
         ([np.nan, 0, 1], {}, "earth_direction"),
         (direction_from_angles(20, 30), {"angular_radius_deg": 90.0}, "earth_angular_radius_deg"),
+        (direction_from_angles(20, 30), {"angular_radius_deg": "wide"}, "earth_angular_radius_deg"),
+        ("up", {}, "earth_direction"),
+        (10**400, {}, "earth_direction"),
         (direction_from_angles(20, 30), {"albedo": 1.5}, "earth_albedo"),
     ],
 )

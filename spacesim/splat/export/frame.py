@@ -8,6 +8,7 @@ import numpy as np
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, quaternion_from_rotation
 from spacesim.data.mesh import UPRIGHT
+from spacesim.splat.compose.pose import MAX_SCALE, MIN_SCALE
 from spacesim.splat.harmonics import rotate_harmonics
 from spacesim.splat.raster.gaussians import Gaussians
 
@@ -24,8 +25,8 @@ class FileFrame:
     recentre: bool = False  #: the middle of the model becomes the origin
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"scale: expected a positive number, found {self.scale:g}")
+        if not MIN_SCALE <= self.scale <= MAX_SCALE:
+            raise InputError(f"scale: expected a number from {MIN_SCALE:g} to {MAX_SCALE:g}, found {self.scale:g}")
         if self.up not in UPRIGHT:
             raise InputError(f"up: expected {', '.join(UPRIGHT)}, found {self.up!r}")
 

@@ -113,6 +113,8 @@ class Projection(ABC):
         (A `Camera` of the part alone would not do: where far splats are linearized depends on the whole image.)
         Raises InputError where the part is empty or reaches beyond the image.
         """
+        if not all(isinstance(value, int | np.integer) for value in (x, y, width, height)):
+            raise InputError(f"crop: expected whole numbers of pixels, found {(x, y, width, height)!r:.60}")
         if not (0 <= x < x + width <= self.width and 0 <= y < y + height <= self.height):
             raise InputError(
                 f"crop: expected a part of the {self.width}x{self.height} pixels, found {width}x{height} at ({x}, {y})"

@@ -137,6 +137,8 @@ class Gaussians:
         for name in NAMES:
             if name not in arrays:
                 raise ValueError(f"{name}: expected an array, found none")
+        if np.ndim(arrays["means"]) != 2:
+            raise ValueError(f"means: expected shape (N, 3), found {np.shape(arrays['means'])}")
         count = len(arrays["means"])
         expected: dict[str, tuple[int, ...]] = {
             "means": (count, 3),

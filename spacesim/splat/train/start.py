@@ -224,7 +224,7 @@ def sky_warning(dataset: Dataset) -> str:
         return ""
     return (
         f"{dataset.root}: expected the object cut out of its black sky, found no alpha, silhouettes or masks: training "
-        "takes the sky for black things around it and loses some dB; spacesim import with --masks auto cuts it out"
+        "takes the sky for black things around it and loses some dB; import with masks auto cuts it out"
     )
 
 

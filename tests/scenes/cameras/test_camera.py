@@ -53,6 +53,14 @@ def test_a_part_of_a_picture_is_a_picture_of_its_own(tmp_path):
     assert "focal = [70.0, 84.0]\nprincipal = [13.0, 11.0]" in scene_text(replace(part, rig=read_scene("boxsat").rig))
 
 
+def test_a_scene_without_them_is_recorded_as_ever():
+    recorded = read_scene("boxsat").to_json()["camera"]
+    assert not {"focal", "principal"} & recorded.keys()
+    assert with_options(read_scene("boxsat"), focal=(700, 700)).to_json()["camera"]["focal"] == (700.0, 700.0)
+    with pytest.raises(InputError, match="background: expected words that say what is drawn, found 1"):
+        with_options(read_scene("boxsat"), background=1)
+
+
 def test_a_lens_is_checked_over_the_part_that_is_seen():
     folds = (-0.3, 0.0, 0.0, 0.0, 0.0)  # 70 pixels from the axis; the middle is 64 from the corners
     CameraConfig((90, 90), focal=(100.0, 100.0), distortion=folds)

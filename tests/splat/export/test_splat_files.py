@@ -237,8 +237,9 @@ def test_what_cannot_be_written_ends_in_a_sentence(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=r"model\.txt: expected a file name that ends in \."):
             write_splats(model(), tmp_path / "model.txt", form, FileFrame())
     for values, words in (
-        ({"scale": 0}, "scale: expected a positive number, found 0"),
+        ({"scale": 0}, r"scale: expected a number from 1e-06 to 1e\+06, found 0"),
         ({"scale": float("nan")}, "scale: .* found nan"),
+        ({"scale": 1e39}, r"scale: expected a number from 1e-06 to 1e\+06, found 1e\+39"),
         ({"up": "x"}, "up: expected z, y, -y, found 'x'"),
     ):
         with pytest.raises(InputError, match=words):
