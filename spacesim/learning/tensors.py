@@ -20,8 +20,8 @@ DIGEST = "sha256"  #: its name in a header
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], header: JsonMapping, form: str) -> None:
     """Write named arrays and a JSON header to `path`, atomically, and a digest of both. form: the word by which
     `read_tensors` knows it."""
-    contiguous = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    known: JsonDict = {"format": form, **header}
+    contiguous = {n: np.ascontiguousarray(value, value.dtype.newbyteorder("<")) for n, value in tensors.items()}
+    known: JsonDict = json.loads(json.dumps({"format": form, **header}))  # as it will be read: keys are strings
     text = json.dumps({**known, DIGEST: _digest(known, contiguous)}, sort_keys=True)
     write_bytes(path, save(contiguous, metadata={"spacesim": text}))  # of two entries the order would be any
 

@@ -292,15 +292,15 @@ def test_an_interrupted_export_leaves_nothing_in_the_way(write, data, tmp_path, 
 
     for out in (tmp_path / "new", tmp_path / "there"):
         if was_there := out.name == "there":
-            (out / ".part").mkdir(parents=True)
-            (out / ".part/old").write_text("of a process that was killed")
+            (out / ".spacesim-part").mkdir(parents=True)
+            (out / ".spacesim-part/old").write_text("of a process that was killed")
         with pytest.raises(KeyboardInterrupt):
             write(read_dataset(data), out, *rest, progress=stop)
         assert list(tmp_path.iterdir()) == [out] * was_there
         assert not was_there or not list(out.iterdir())
         write(read_dataset(data), out, *rest)
         assert len(list(out.rglob("*.tar" if write is write_webdataset else "*.png"))) >= 6
-        assert not [path for name in ("old", ".part") for path in out.rglob(name)]
+        assert not [path for name in ("old", ".spacesim-part") for path in out.rglob(name)]
         shutil.rmtree(out)
 
 

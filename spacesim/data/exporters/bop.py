@@ -29,11 +29,11 @@ from spacesim.data.exporters.objects import (
     LabelledObject,
     labelled_objects,
     model_numbers,
-    new_folder,
     opaque_picture,
 )
 from spacesim.data.files import JsonDict, write_bytes, write_json
 from spacesim.data.images import write_png
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.records import Camera, Dataset, Frame
 from spacesim.data.store import load_truth
 
@@ -77,7 +77,7 @@ def write_bop(
             raise InputError(f"{frame.file_path}: expected an image without lens distortion, which BOP does not know")
     targets = labelled_objects(dataset)
     bodies = body_labels(dataset, targets, keypoints)
-    with new_folder(out) as out:
+    with replaced_content(out) as out:
         models = model_numbers(targets)
         _write_models(out, targets, models, bodies)
         write_body_labels(out / NAME, bodies)

@@ -14,10 +14,11 @@ from pathlib import Path
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
 from spacesim.data.exporters.labels import OUTSIDE, DatasetLabeller, Instance
 from spacesim.data.exporters.masks import run_lengths
-from spacesim.data.exporters.objects import ExportProgress, frame_camera, new_folder, opaque_picture
+from spacesim.data.exporters.objects import ExportProgress, frame_camera, opaque_picture
 from spacesim.data.files import JsonDict, write_json
 from spacesim.data.identity import frame_names
 from spacesim.data.images import write_png
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.records import Dataset, Frame
 
 HALF = 0.5  # from our pixel coordinates to those of COCO's keypoints
@@ -32,7 +33,7 @@ def write_coco(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    with new_folder(out) as out:
+    with replaced_content(out) as out:
         categories = [
             {
                 "id": category.number,

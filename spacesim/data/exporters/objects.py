@@ -1,18 +1,14 @@
 """What every exporter needs of a dataset: the objects with their poses and meshes, and opaque pictures."""
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from spacesim.data.errors import InputError, expect
-from spacesim.data.files import holds_files
 from spacesim.data.geometry import Array
 from spacesim.data.images import read_exr, read_png
 from spacesim.data.images.tone import TONES, as_bytes, display_values
-from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.mesh import MAX_COORDINATE, check_points, load_mesh
 from spacesim.data.records import Camera, Dataset, Frame
 
@@ -154,11 +150,3 @@ def frame_camera(frame: Frame) -> dict[str, float | list[float]]:
     """Intrinsics of the stored picture, pixels, and k1, k2, p1, p2, k3 of its lens."""
     camera, lens = frame.camera, list(frame.distortion or (0.0,) * 5)
     return {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "distortion": lens}
-
-
-def new_folder(out: Path) -> AbstractContextManager[Path]:
-    """Where to write what `out`, which must be new or empty, holds in the end, see `replaced_content`."""
-    out = Path(out)
-    if out.exists() and (not out.is_dir() or holds_files(out)):
-        raise InputError(f"{out}: expected a new or empty folder, found a file or files in it")
-    return replaced_content(out)

@@ -25,7 +25,6 @@ from spacesim.data.exporters.labels import DatasetLabeller
 from spacesim.data.exporters.objects import (
     ExportProgress,
     LabelledObject,
-    new_folder,
     opaque_picture,
     select_object,
 )
@@ -33,6 +32,7 @@ from spacesim.data.files import MAX_LIST_BYTES, JsonDict, read_json, write_json
 from spacesim.data.geometry import camera_that_sees, quaternion_from_rotation
 from spacesim.data.identity import frame_names
 from spacesim.data.images import read_labels, write_png
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.records import Camera, Dataset, Frame
 
 PIXEL_PITCH = 5.86e-6
@@ -63,7 +63,7 @@ def write_speedplus(
         raise InputError(f"keypoints: expected with a dataset that has a mesh, found {dataset.root}, an import")
     target = select_object(labeller.targets if labeller else [BODY], target_name)
     camera = _camera(dataset.frames)
-    with new_folder(out) as out:
+    with replaced_content(out) as out:
         frames = dataset.frames
         names = [f"{name}.png" for name in frame_names(frames)]
         points: JsonDict = {}

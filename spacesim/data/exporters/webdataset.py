@@ -15,10 +15,11 @@ from pathlib import Path
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
 from spacesim.data.exporters.labels import DatasetLabeller, Instance
 from spacesim.data.exporters.masks import run_lengths
-from spacesim.data.exporters.objects import ExportProgress, frame_camera, new_folder, opaque_picture
+from spacesim.data.exporters.objects import ExportProgress, frame_camera, opaque_picture
 from spacesim.data.files import JsonDict, json_bytes, read_bytes, write_bytes
 from spacesim.data.identity import frame_names
 from spacesim.data.images import png_bytes
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.records import Dataset, Frame
 
 SHARD = 1 << 28  #: bytes after which a shard is full
@@ -36,7 +37,7 @@ def write_webdataset(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    with new_folder(out) as out:
+    with replaced_content(out) as out:
         names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))
         done, shards = 0, 0
         for split, frames in (("train", dataset.train), ("val", dataset.test)):

@@ -18,10 +18,11 @@ import numpy as np
 from spacesim.data.exporters.keypoints import NAME, write_body_labels
 from spacesim.data.exporters.labels import DatasetLabeller, Instance
 from spacesim.data.exporters.masks import outline
-from spacesim.data.exporters.objects import ExportProgress, new_folder, opaque_picture
+from spacesim.data.exporters.objects import ExportProgress, opaque_picture
 from spacesim.data.files import write_bytes
 from spacesim.data.identity import frame_names
 from spacesim.data.images import write_png
+from spacesim.data.integrity.outputs import replaced_content
 from spacesim.data.records import Dataset
 
 TASKS = ("detect", "segment", "pose")
@@ -36,7 +37,7 @@ def write_yolo(
     where pictures cannot be read, and for a folder that is not empty.
     """
     labeller = DatasetLabeller(dataset, keypoints)
-    with new_folder(out) as out:
+    with replaced_content(out) as out:
         classes = [category.name for category in labeller.categories]
         most = max(len(body.keypoints) for body in labeller.bodies)
         names = dict(zip(dataset.frames, frame_names(dataset.frames), strict=True))

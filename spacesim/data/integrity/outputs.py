@@ -1,5 +1,6 @@
 """What is written: a file or a folder takes the place of an earlier one of its own kind, and of nothing else."""
 
+import errno
 import os
 import re
 import shutil
@@ -8,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 from spacesim.data.errors import InputError
-from spacesim.data.files import MAX_LIST_BYTES, read_json, remove_leftovers
+from spacesim.data.files import MAX_LIST_BYTES, holds_files, read_json, remove_leftovers
 from spacesim.data.integrity.manifest import NAME as DIGESTS
 from spacesim.data.integrity.manifest import read_manifest
 from spacesim.data.lock import lock_folder
@@ -27,7 +28,8 @@ SUFFIXES = {
 }
 """{kind of file: suffixes of its names}."""
 
-PART = ".part"  #: hidden, in a folder that is being written
+PART, WRITTEN, CLEARED = ".spacesim-part", ".spacesim-written", ".spacesim-cleared"
+"""Hidden, in a folder that is being written: content that is not complete, that is, and what it replaces is gone."""
 
 _RUN = re.compile(
     r"(config|training|cameras)\.json|(model|poses)\.safetensors|checkpoints/(step_\d+\.safetensors|seconds\.json)"
@@ -99,6 +101,9 @@ def check_evaluation_folder(out: Path) -> None:
     mine = next((name for name in ("metrics.json", "report.html") if (out / name).exists()), None)
     if mine and not _is_evaluation(out):
         raise InputError(f"{out}: expected a new folder, or one of an earlier evaluation, found another {mine} in it")
+    for name in ("frames", "relight", "geometry"):
+        if (out / name).is_file():
+            raise InputError(f"{out / name}: expected room for a folder, found a file")
 
 
 def _is_evaluation(folder: Path) -> bool:
@@ -137,21 +142,32 @@ def clear_sweep(out: Path) -> None:
 @contextmanager
 def replaced_content(out: Path, clear: Callable[[Path], None] | None = None) -> Iterator[Path]:
     """A hidden folder in `out` to write into. When the `with` block ends, what it holds takes the place of what `clear`
-    takes away from `out`; where the block raises, `out` is as it was before. Raises InputError where it cannot be
-    written, and where another process is writing into it."""
+    takes away from `out`; without `clear`, `out` must be new or empty. Where the block raises, `out` is as it was
+    before; a process that is killed while files take their places leaves them to the next call, which goes on.
+
+    Raises InputError where `out` is no such folder or cannot be written, where another process is writing into it, and
+    where a file would take the place of a folder, or a folder that of a file.
+    """
     out = Path(out)
     was_there, part = out.exists(), out / PART
     with lock_folder(out):
         try:
             with _written(out):
-                if part.exists():  # of a process that was killed
+                _put_in_place(out, clear)  # of a process that was killed
+                if part.exists():
                     shutil.rmtree(part)
+                _check_content(out, clear is None)
                 part.mkdir(parents=True)
             yield part
             with _written(out):
-                if clear is not None:
-                    clear(out)
-                _move_content(part, out)
+                _check_content(out, clear is None)
+                _check_places(part, out)
+                part.rename(out / WRITTEN)
+                try:
+                    _put_in_place(out, clear)
+                except KeyboardInterrupt:
+                    _put_in_place(out, clear)  # that takes a moment
+                    raise
         finally:
             shutil.rmtree(part, ignore_errors=True)
             if not was_there:
@@ -159,12 +175,40 @@ def replaced_content(out: Path, clear: Callable[[Path], None] | None = None) -> 
                     out.rmdir()
 
 
+def _put_in_place(out: Path, clear: Callable[[Path], None] | None) -> None:
+    """Go on, from wherever it was, with what makes complete content that of `out`."""
+    if (out / WRITTEN).exists():
+        if clear is not None:
+            clear(out)
+        (out / WRITTEN).rename(out / CLEARED)
+    if (out / CLEARED).exists():
+        _move_content(out / CLEARED, out)
+        (out / CLEARED).rmdir()
+
+
+def _check_content(out: Path, is_new: bool) -> None:
+    if out.exists() and (not out.is_dir() or (is_new and holds_files(out))):
+        expected = "a new or empty folder" if is_new else "a folder"
+        raise InputError(f"{out}: expected {expected}, found a file or files in it")
+
+
 @contextmanager
 def _written(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{folder}: expected a folder that can be written ({error.strerror})") from None
+        raise InputError(f"{folder}: expected a folder that can be written ({error.strerror or error})") from None
+
+
+def _check_places(source: Path, target: Path) -> None:
+    """Raise InputError where what is in `source` cannot take its place in `target`."""
+    for path in source.iterdir():
+        place = target / path.name
+        if place.exists() and path.is_dir() != place.is_dir():
+            kinds = ("folder", "file") if path.is_dir() else ("file", "folder")
+            raise InputError(f"{place}: expected room for a {kinds[0]}, found a {kinds[1]}")
+        if path.is_dir() and place.is_dir():
+            _check_places(path, place)
 
 
 def _move_content(source: Path, target: Path) -> None:
@@ -173,8 +217,14 @@ def _move_content(source: Path, target: Path) -> None:
         place = target / path.name
         if path.is_dir() and place.is_dir():
             _move_content(path, place)
-        else:
+            path.rmdir()
+            continue
+        try:
             path.replace(place)
+        except OSError as error:
+            if error.errno != errno.EXDEV:  # a link leads to another disk
+                raise
+            shutil.move(path, place)
 
 
 def _files(folder: Path) -> Iterator[str]:

@@ -36,7 +36,7 @@ def test_the_nearest_border_says_what_fits():
 
 
 def test_a_part_of_a_picture_is_a_picture_of_its_own(tmp_path):
-    """With the principal point moved: the same depths, and the points of transforms.json's camera lie on them."""
+    """With the principal point moved: the same depths."""
     scene = with_options(read_scene("boxsat"), resolution=SIZE, spp=1, points=10, min_sunlit=None)
     camera = ss.Camera.look_at([7, -6, 4], [0, 0, 0], *SIZE, fov_x_deg=30)
     scene = with_options(scene, rig=ss.PoseRig(camera.world_from_camera[None], sun=(40, 25)))
