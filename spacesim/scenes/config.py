@@ -14,7 +14,7 @@ from spacesim.data.files import JsonDict
 from spacesim.data.records import Sun
 from spacesim.data.structure import did_you_mean, field_value
 from spacesim.scenes.background.config import BackgroundConfig
-from spacesim.scenes.cameras.camera import CameraConfig
+from spacesim.scenes.cameras.camera import FOV_DEG, CameraConfig
 from spacesim.scenes.cameras.rig import Rig
 from spacesim.scenes.cameras.sphere_rigs import FibonacciRig
 from spacesim.scenes.lights.earth import EarthConfig
@@ -154,9 +154,9 @@ class SceneConfig:
         """Plain JSON values, without the folder: a dataset does not depend on where its scene file lay."""
         values = {**asdict(replace(self, folder=None, rig=FibonacciRig())), "rig": self.rig.to_json()}
         del values["folder"]
-        for name in ("focal", "principal"):
-            if values["camera"][name] is None:
-                del values["camera"][name]
+        unused = [name for name in ("focal", "principal") if values["camera"][name] is None]
+        for name in unused if self.camera.focal is None else [*unused, "fov_deg"]:
+            del values["camera"][name]
         rig = {key: value for key, value in values["rig"].items() if value or key not in _UNLESS_ASKED_FOR}
         if self.background is None:
             del values["background"]
@@ -198,6 +198,7 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
             value = _angles_of(value) if name == "sun" else value
             of_words = name == "background"  # which is a record or the words of one
             changes[part][name] = value if of_words else field_value(type(_part(scene, part)), name, value)
+    _choose_lens(changes["camera"])
     rig = changes["rig"]
     if "sun" in rig:
         if "suns" in names_by_part["rig"]:
@@ -208,6 +209,16 @@ def with_options(scene: SceneConfig, **options: object) -> SceneConfig:
         changes[""]["background"] = (scene.background or BackgroundConfig()).showing(words)
     parts = {part: replace(getattr(scene, part), **changed) for part, changed in changes.items() if part}
     return replace(scene, **changes[""], **parts)
+
+
+def _choose_lens(camera: JsonDict) -> None:
+    """Of a focal length and an angle of view, the one that changes takes the place of the scene's other one."""
+    if "focal" in camera and "fov_deg" in camera:
+        raise InputError("focal: expected alone, found fov_deg beside it")
+    if "focal" in camera:
+        camera["fov_deg"] = FOV_DEG
+    elif "fov_deg" in camera:
+        camera["focal"] = None
 
 
 def _part(scene: SceneConfig, name: str) -> object:

@@ -56,7 +56,10 @@ def scene_text(scene: SceneConfig) -> str:
         raise InputError(f"rig: expected one that a scene file can say, found {rig_kind(scene.rig)}")
     folder = scene.folder or Path()
     objects = tuple(replace(item, mesh=_from_here(folder / item.mesh)) if item.mesh else item for item in scene.objects)
-    return toml.dump(_plain(replace(scene, objects=objects, rig=scene.rig.located(folder))))
+    values = _plain(replace(scene, objects=objects, rig=scene.rig.located(folder)))
+    if scene.camera.focal is not None:
+        del values["camera"]["fov_deg"]
+    return toml.dump(values)
 
 
 def _mesh_scene(path: Path, source: str, reading: JsonMapping) -> SceneConfig:

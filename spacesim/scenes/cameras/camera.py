@@ -63,7 +63,7 @@ class CameraConfig:
         expect(MIN_FOV <= self.fov_deg <= MAX_FOV, "fov_deg", angles, self.fov_deg)
         if self.focal is not None:
             if self.fov_deg != FOV_DEG:
-                raise InputError("focal: expected alone, found fov_deg beside it")
+                raise InputError(f"focal: expected alone, found fov_deg {self.fov_deg:g} beside it")
             positive = all(math.isfinite(length) and length > 0 for length in self.focal)
             expect(positive, "focal", "positive numbers of pixels", list(self.focal))
         if self.principal is not None:
@@ -90,6 +90,11 @@ class CameraConfig:
         return [
             (-c / f, (side - c) / f) for c, f, side in zip(centre, self.focal_lengths, self.resolution, strict=True)
         ]
+
+    @property
+    def nearest_border(self) -> float:
+        """How far the nearest border is from the axis, 1 where this is in the middle, 0 where it is at the border."""
+        return min(2 * min(-low, high) / (high - low) for low, high in self._sides)
 
     @property
     def half_tangents(self) -> tuple[float, float]:

@@ -23,6 +23,9 @@ evaluation."""
 MARGIN = 1.05
 """How much larger than the object's bounding sphere the frame is."""
 
+NEAR_BORDER = 0.25
+"""Of `CameraConfig.nearest_border`: nearer to it than that, framing by the axis makes the object small."""
+
 MIN_METRES, MAX_METRES = 1e-9, 1e12
 """Metres of distances."""
 
@@ -195,7 +198,10 @@ def held_out_suns(count: int, seed: int) -> list[Sun]:
 
 
 def fitting_distance(radius: float, camera: CameraConfig) -> float:
-    """Distance, metres, from which a sphere of `radius` metres fills the shorter side of the frame but for MARGIN."""
+    """Distance, metres, from which a sphere of `radius` metres fills the shorter side of the frame but for MARGIN.
+    Raises InputError for a camera whose axis is so near a border that it would be a dot."""
+    if camera.nearest_border < NEAR_BORDER:
+        raise InputError("principal: expected a point nearer to the middle where the rig is to choose the distance")
     return MARGIN * radius / float(np.sin(0.5 * camera.smallest_fov))
 
 

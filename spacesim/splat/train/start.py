@@ -10,7 +10,7 @@ from spacesim.data.errors import InputError
 from spacesim.data.geometry import is_near
 from spacesim.data.images import load_image
 from spacesim.data.mesh import read_mesh, read_points
-from spacesim.data.records import Dataset, Frame
+from spacesim.data.records import Dataset, Image
 from spacesim.learning.cameras import focus_point, nearest_camera
 from spacesim.splat.raster.cameras import NEAR
 from spacesim.splat.raster.gaussians import SH_C0, Gaussians
@@ -22,6 +22,7 @@ COARSE = 0.05  #: pixels: steps of 0.1 cost 0.4 dB of 26.6, those of 1 pixel 1.9
 MANY_PICTURES = 100  #: that unknown Suns are estimated from: 15 degrees off like SPEED+'s, 28 of 60, 41 of 40
 MANY_STEPS = 2_000  #: the same: after 800 they were off by 93 degrees, while halves of pictures agreed to 26
 LOOKED_AT = 32  #: training pictures, at most, that are looked at for whether the object is cut out
+FEW_LOOKED_AT = 8  #: the same, for whether they show a sky: large ones take a second each
 CUT_AWAY = 0.02  #: least share of a picture's pixels that are empty or ignored, where the object is cut out
 BLACK, SKY = 0.05, 0.2  #: sRGB value of the brightest black sky, and its least share of a picture before it
 FEW_LEFT = 0.1  #: of the most Gaussians that training had: fewer at its end are told
@@ -208,7 +209,7 @@ def sun_warning(dataset: Dataset, iterations: int) -> str:
     if len(dataset.train) < MANY_PICTURES:
         lacking.append(f"{len(dataset.train)} training pictures where it takes {MANY_PICTURES} or more")
     looked_at = dataset.train[:: -(-len(dataset.train) // LOOKED_AT)]
-    bare = sum(not _is_cut_out(dataset, frame) for frame in looked_at)
+    bare = sum(not _is_cut_out(load_image(dataset, frame)) for frame in looked_at)
     if 2 * bare > len(looked_at):
         lacking.append("no silhouette, mask or alpha that separates the object from what is behind it")
     lack = " and ".join(lacking)
@@ -218,9 +219,8 @@ def sun_warning(dataset: Dataset, iterations: int) -> str:
 def sky_warning(dataset: Dataset) -> str:
     """A sentence where the object stands before a black sky and is not cut out of most pictures: Gaussians then learn
     the sky, as black things around the object; "" elsewhere."""
-    looked_at = dataset.train[:: -(-len(dataset.train) // LOOKED_AT)]
-    before_sky = sum(_is_before_sky(dataset, frame) for frame in looked_at)
-    if 2 * before_sky <= len(looked_at):
+    looked_at = dataset.train[:: -(-len(dataset.train) // FEW_LOOKED_AT)]
+    if 2 * sum(_is_before_sky(load_image(dataset, frame)) for frame in looked_at) <= len(looked_at):
         return ""
     return (
         f"{dataset.root}: expected the object cut out of its black sky, found no alpha, silhouettes or masks: training "
@@ -239,14 +239,17 @@ def few_left_warning(history: Sequence[Mapping[str, float]]) -> str:
     )
 
 
-def _is_before_sky(dataset: Dataset, frame: Frame) -> bool:
-    """Whether nothing separates the object from a black sky in a picture."""
-    return not _is_cut_out(dataset, frame) and bool((load_image(dataset, frame).rgb.max(axis=2) < BLACK).mean() > SKY)
+def _is_before_sky(image: Image) -> bool:
+    """Whether a picture is black, also at its border, and nothing separates the object from that."""
+    if _is_cut_out(image):
+        return False
+    black = image.rgb.max(axis=2) < BLACK
+    border = np.concatenate([black[0], black[-1], black[:, 0], black[:, -1]])
+    return bool(black.mean() > SKY and border.mean() > 0.5)
 
 
-def _is_cut_out(dataset: Dataset, frame: Frame) -> bool:
+def _is_cut_out(image: Image) -> bool:
     """Whether a picture's pixels tell the object from what is behind it, be it by alpha, silhouette or mask."""
-    image = load_image(dataset, frame)
     return float(((image.alpha < 0.5) | ~image.valid).mean()) >= CUT_AWAY
 
 

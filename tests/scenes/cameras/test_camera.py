@@ -61,6 +61,26 @@ def test_a_scene_without_them_is_recorded_as_ever():
         with_options(read_scene("boxsat"), background=1)
 
 
+def test_what_is_given_takes_the_place_of_the_scenes_own():
+    scene = read_scene("speedplus")  # which has an angle
+    camera = with_options(scene, focal=(2988.58, 2988.34)).camera
+    assert (camera.focal, with_options(scene).camera.focal) == ((2988.58, 2988.34), None)
+    long = with_options(read_scene("boxsat"), focal=(700, 710))
+    assert "fov_deg" not in long.to_json()["camera"]
+    assert "fov_deg" not in scene_text(long)
+    assert with_options(long, fov_deg=30).camera == read_scene("boxsat").camera
+    with pytest.raises(InputError, match="focal: expected alone, found fov_deg beside it"):
+        with_options(scene, focal=(700, 700), fov_deg=20)
+
+
+def test_a_rig_does_not_frame_by_an_axis_at_the_border(tmp_path):
+    scene = with_options(read_scene("boxsat"), resolution=64, principal=(7.0, 32.0))
+    with pytest.raises(InputError, match="principal: expected a point nearer to the middle where the rig is to choose"):
+        generate(scene, tmp_path / "data")
+    near = with_options(scene, principal=(9.0, 32.0)).camera
+    assert near.nearest_border == pytest.approx(9 / 32)
+
+
 def test_a_lens_is_checked_over_the_part_that_is_seen():
     folds = (-0.3, 0.0, 0.0, 0.0, 0.0)  # 70 pixels from the axis; the middle is 64 from the corners
     CameraConfig((90, 90), focal=(100.0, 100.0), distortion=folds)
@@ -73,7 +93,7 @@ def test_a_lens_is_checked_over_the_part_that_is_seen():
     [
         ({"focal": (70.0, 0.0)}, r"focal: expected positive numbers of pixels, found \[70.0, 0.0\]"),
         ({"focal": (math.nan, 70.0)}, "focal: expected positive numbers of pixels"),
-        ({"focal": (70.0, 70.0), "fov_deg": 40.0}, "focal: expected alone, found fov_deg beside it"),
+        ({"focal": (70.0, 70.0), "fov_deg": 40.0}, "focal: expected alone, found fov_deg 40 beside it"),
         (
             {"focal": (1.0, 70.0)},
             r"focal: expected an angle from 0.001 to 120 degrees across the image, found 175\.\d+ by",

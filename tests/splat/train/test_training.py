@@ -434,6 +434,12 @@ def test_a_black_sky_without_alpha_is_warned_of(small_dataset, tmp_path):
 
     assert sky_warning(small_dataset) == shown(0.3) == shown(0.0, masks=True) == ""
     assert "cut out of its black sky, found no alpha, silhouettes or masks" in shown(0.0)
+    for frame in small_dataset.train:  # a black object before a wall
+        pixels = np.full((frame.camera.height, frame.camera.width, 3), 120, np.uint8)
+        pixels[8:-8, 8:-8] = 5
+        write_png(tmp_path / Path(frame.file_path).name, pixels)
+    walled = [replace(frame, file_path=Path(frame.file_path).name) for frame in small_dataset.train]
+    assert sky_warning(replace(small_dataset, root=tmp_path, train=tuple(walled))) == ""
 
 
 def test_few_gaussians_at_the_end_are_warned_of():
