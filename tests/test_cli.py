@@ -16,7 +16,7 @@ import trimesh
 from tiny import GENERATE, PROGRAM, TRAIN, contents
 
 from spacesim.cli.parser import view_of
-from spacesim.cli.printing import RELATIVE
+from spacesim.cli.printing import RELATIVE, print_headline
 from spacesim.cli.program import COMMANDS as ALL_COMMANDS
 from spacesim.cli.program import in_flags, parser
 from spacesim.data.errors import InputError
@@ -865,3 +865,24 @@ def test_the_package_is_a_program_too():
         [sys.executable, "-m", "spacesim", "--version"], capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stdout.split()[:1]) == (0, ["spacesim"]), done.stderr
+
+
+def test_an_evaluation_is_told_in_few_lines(capsys):
+    def mean(value: float) -> dict[str, dict[str, float]]:
+        return {"mean": value}
+
+    partly = [f"{what} is null in {count} of 60 frames: the truth lacks it." for what, count in (("A", 2), ("B", 1))]
+    metrics = {
+        "image": {"psnr": mean(30.0), "ssim": mean(0.9), "flip": mean(0.05)},
+        "shadow_other_cast": {"balanced_error_rate": mean(0.078), "iou": mean(0.83)},
+        "notes": ["LPIPS is null; torch is not installed.", *partly],
+    }
+    print_headline(metrics)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1:] == [
+        "shadows that another object casts: balanced error rate 0.0780, IoU 0.8300",
+        "note: LPIPS is null; torch is not installed.",
+        "note: 2 measures are null in some frames; metrics.json says why",
+    ]
+    print_headline({**metrics, "notes": partly[:1]})
+    assert capsys.readouterr().out.splitlines()[-1] == f"note: {partly[0]}"

@@ -1,5 +1,6 @@
 """What several commands print."""
 
+import re
 from functools import partial
 
 from spacesim import interrupts
@@ -9,6 +10,8 @@ KNOWS_ONE_LIGHT = "the run knows the light that it was trained under only; --sun
 NO_EARTH = "the run has learned the Earth's light, which is left out; --earth AZ,EL adds it"
 WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filter draw thin splats wider"
 RELATIVE = "the data that says how bright the Sun was is not there: albedo is relative, to a Sun at 1 au and 0 EV"
+
+_IN_SOME_FRAMES = re.compile(r" is null in \d+ of \d+ frames")
 
 
 def print_headline(metrics: JsonDict) -> None:
@@ -27,6 +30,9 @@ def print_headline(metrics: JsonDict) -> None:
         pooled = metrics["shadow_mask"]["error_rate"]
         pooled_words = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
         interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
+    if metrics.get("shadow_other_cast"):
+        share, overlap = show("shadow_other_cast", "balanced_error_rate", 4), show("shadow_other_cast", "iou", 4)
+        interrupts.print_output(f"shadows that another object casts: balanced error rate {share}, IoU {overlap}")
     if (metrics.get("material") or {}).get("albedo_error"):
         words = f"albedo error {show('material', 'albedo_error', 3)}, normals {show('material', 'normals_deg', 1)}"
         interrupts.print_output(f"materials: {words} degrees")
@@ -35,8 +41,12 @@ def print_headline(metrics: JsonDict) -> None:
         interrupts.print_output(f"PSNR: {known_psnr} dB under known Suns, {unseen_psnr} dB under Suns never seen")
     if (metrics.get("geometry") or {}).get("chamfer") is not None:
         interrupts.print_output(_shape_words(metrics["geometry"]))
-    for note in metrics.get("notes", []):
+    notes = metrics.get("notes", [])
+    partial_ones = [note for note in notes if _IN_SOME_FRAMES.search(note)]
+    for note in notes if len(partial_ones) < 2 else [note for note in notes if note not in partial_ones]:
         interrupts.print_output(f"note: {note}")
+    if len(partial_ones) >= 2:
+        interrupts.print_output(f"note: {len(partial_ones)} measures are null in some frames; metrics.json says why")
 
 
 def _shape_words(geometry: JsonDict) -> str:
