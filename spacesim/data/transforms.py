@@ -284,16 +284,18 @@ def _read_camera(values: Json, image: Path) -> Camera:
         raise InputError(f"expected true or false as is_fisheye, found {fisheye!r}")
     model = "OPENCV_FISHEYE" if fisheye else values.get("camera_model", "OPENCV")
     if model not in _PERSPECTIVE:
+        found = model if str(model).isidentifier() else f"{model!r:.60}"
         help_ = "; spacesim import nerfstudio undistorts it" if model == "OPENCV_FISHEYE" else ""
-        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {model}{help_}")
+        raise InputError(f"expected a camera_model among {', '.join(_PERSPECTIVE)}, found {found}{help_}")
     if "w" in values and "h" in values:
         width, height = round(_number(values, "w")), round(_number(values, "h"))
     else:
         width, height = image_size(image)
     fx = _focal_length(values, "fl_x", "camera_angle_x", width)
-    fy = _focal_length(values, "fl_y", "camera_angle_y", height) or fx
-    if fx is None or fy is None:
+    fy = _focal_length(values, "fl_y", "camera_angle_y", height)
+    if fx is None:
         raise InputError("expected fl_x or camera_angle_x, found neither")
+    fy = fx if fy is None else fy
     cx, cy = _number(values, "cx", 0.5 * width), _number(values, "cy", 0.5 * height)
     pose = _read_pose(values)
     camera = Camera(pose @ OPENCV_FROM_OPENGL, width, height, fx, fy, cx, cy)

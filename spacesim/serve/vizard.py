@@ -139,7 +139,8 @@ class Simulation:
 
     def _mounted(self, number: int) -> MountedCamera:
         if number not in self._cameras:
-            raise InputError(f"camera: expected one of {sorted(self._cameras)}, found {number}")
+            known = f"one of {sorted(self._cameras)}" if self._cameras else "a camera that Basilisk has mounted"
+            raise InputError(f"camera: expected {known}, found {number}")
         return self._cameras[number]
 
     def _carrier(self, camera: MountedCamera) -> Body:
