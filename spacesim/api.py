@@ -19,8 +19,9 @@ from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import JsonDict, JsonMapping, as_path
+from spacesim.data.geometry import as_numbers
 from spacesim.data.images import load_image
-from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, as_numbers, check_camera
+from spacesim.data.records import Camera, Dataset, Frame, Image, Sun, Truth, check_camera
 from spacesim.data.store import load_depth, load_truth
 from spacesim.data.structure import Rules, checked, did_you_mean, field_value, places_of
 from spacesim.data.toml import dotted

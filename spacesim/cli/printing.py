@@ -42,11 +42,12 @@ def print_headline(metrics: JsonDict) -> None:
     if (metrics.get("geometry") or {}).get("chamfer") is not None:
         interrupts.print_output(_shape_words(metrics["geometry"]))
     notes = metrics.get("notes", [])
-    partial_ones = [note for note in notes if _IN_SOME_FRAMES.search(note)]
-    for note in notes if len(partial_ones) < 2 else [note for note in notes if note not in partial_ones]:
+    partly = [note for note in notes if _IN_SOME_FRAMES.search(note)]
+    if len(partly) > 1:
+        rest = [note for note in notes if note not in partly]
+        notes = [*rest, f"{len(partly)} measures are null in some frames; metrics.json says why"]
+    for note in notes:
         interrupts.print_output(f"note: {note}")
-    if len(partial_ones) >= 2:
-        interrupts.print_output(f"note: {len(partial_ones)} measures are null in some frames; metrics.json says why")
 
 
 def _shape_words(geometry: JsonDict) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spacesim.data.errors import expect
-from spacesim.data.geometry import Array, normalize, perpendicular
+from spacesim.data.geometry import Array, as_numbers, normalize, perpendicular
 
 EARTH_ALBEDO = 0.294
 """Bond albedo of the Earth (D. R. Williams, "Earth Fact Sheet", NASA Goddard Space Flight Center); to the two digits
@@ -29,10 +29,7 @@ class Earth:
     albedo: float = EARTH_ALBEDO  #: of the sphere, the same in all channels
 
     def __post_init__(self) -> None:
-        try:
-            direction = np.asarray(self.direction, np.float64)
-        except (TypeError, ValueError, OverflowError):
-            direction = np.zeros(0)
+        direction = as_numbers(self.direction)
         is_vector = direction.shape == (3,) and bool(np.isfinite(direction).all() and np.abs(direction).max() > 0)
         expect(is_vector, "earth_direction", "3 finite numbers, not all 0", self.direction)
         radius = self.angular_radius_deg

@@ -183,3 +183,11 @@ def _from_median(means: Array) -> Array:
 
 def _radius_within(away: Array) -> float:
     return max(float(np.quantile(away, 0.99)), 1e-9)
+
+
+def as_numbers(value: object) -> Array:
+    """As float64 of any shape, [0] of what is no array of real numbers, as text is not."""
+    try:
+        return np.asarray(value, np.float64) if np.asarray(value).dtype.kind not in "USc" else np.zeros(0)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)

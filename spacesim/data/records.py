@@ -15,6 +15,7 @@ from spacesim.data.geometry import (
     OPENCV_FROM_OPENGL,
     Array,
     angles_from_direction,
+    as_numbers,
     as_rotation,
     direction_from_angles,
     look_at,
@@ -41,14 +42,6 @@ def planes_repr(record: object, width: int, height: int) -> str:
     values = {field.name: getattr(record, field.name) for field in fields(cls)}
     names = [name for name, value in values.items() if not isinstance(value, int | str | None)]
     return f"{cls.__name__}({width} x {height} pixels: {', '.join(names)})"
-
-
-def as_numbers(value: object) -> Array:
-    """As float64 of any shape, [0] of what is no array of real numbers, as text is not."""
-    try:
-        return np.asarray(value, np.float64) if np.asarray(value).dtype.kind not in "USc" else np.zeros(0)
-    except (TypeError, ValueError, OverflowError):
-        return np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,10 +25,10 @@ import numpy as np
 from spacesim.data.earth import EARTH_ALBEDO, Earth
 from spacesim.data.errors import InputError
 from spacesim.data.files import MAX_LIST_BYTES, JsonValue, as_path, read_json
-from spacesim.data.geometry import OPENCV_FROM_OPENGL
+from spacesim.data.geometry import OPENCV_FROM_OPENGL, as_numbers
 from spacesim.data.images import check_lens, image_size
 from spacesim.data.integrity.manifest import NAME as DIGESTS
-from spacesim.data.records import MAX_SIDE, SUN_WORDS, Camera, Dataset, Frame, Sun, as_numbers
+from spacesim.data.records import MAX_SIDE, SUN_WORDS, Camera, Dataset, Frame, Sun
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 TRUTH_PATHS = ("gt_path", "shadow_path", "silhouette_path", "id_path", "depth_file_path", "mask_path")

@@ -27,7 +27,7 @@ from spacesim.learning.folder import (
     write_checkpoint,
 )
 from spacesim.learning.forecast import TimeLeft
-from spacesim.learning.tensors import read_tensors, write_tensors
+from spacesim.learning.tensors import first_not_finite, read_tensors, write_tensors
 
 HISTORY_EVERY = 50  #: iterations between two entries of the history
 
@@ -106,7 +106,7 @@ class TrainingLoop(ABC):
             raise InputError(f"{path}: expected a checkpoint of training, found one that lacks {name}") from None
         except ValueError as error:
             raise InputError(f"{path}: expected a checkpoint of this training ({error})") from None
-        if broken := _not_finite(self.model_tensors()):
+        if broken := first_not_finite(self.model_tensors()):
             raise InputError(f"{path}: expected finite numbers as {broken}, found others")
         self.iteration, self.history = header.iteration, [asdict(entry) for entry in header.history]
 
@@ -199,12 +199,7 @@ class TrainingLoop(ABC):
     def _finite_model(self) -> dict[str, np.ndarray]:
         """`model_tensors`. Raises WorkError where some are not finite: what is not drawn is not seen in the loss."""
         model = self.model_tensors()
-        if broken := _not_finite(model):
+        if broken := first_not_finite(model):
             at = f"at iteration {self.iteration}; the last checkpoint is kept"
             raise WorkError(f"training: {broken} of the model are not finite {at}")
         return model
-
-
-def _not_finite(tensors: Mapping[str, np.ndarray]) -> str:
-    """The first that has a number that is not finite; "" where all are."""
-    return next((name for name, values in tensors.items() if not np.isfinite(values).all()), "")

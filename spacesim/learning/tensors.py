@@ -49,6 +49,11 @@ def read_tensors(path: Path, form: str) -> tuple[dict[str, np.ndarray], JsonDict
     return tensors, header
 
 
+def first_not_finite(tensors: Mapping[str, np.ndarray]) -> str:
+    """Name of the first that has a number that is not finite; "" where all are."""
+    return next((name for name, values in tensors.items() if not np.isfinite(values).all()), "")
+
+
 def _digest(header: JsonMapping, tensors: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of a header and of named arrays, contiguous ones."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())

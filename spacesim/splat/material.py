@@ -10,9 +10,9 @@ from spacesim.backend.arrays import Bool
 from spacesim.backend.upload import upload, upload_rows
 from spacesim.data.errors import InputError
 from spacesim.data.files import JsonMapping, read_json
-from spacesim.data.geometry import Array
+from spacesim.data.geometry import Array, as_numbers
 from spacesim.data.images.tone import STANDARD_EXPOSURE, Curve, Tone, tone_and_exposure
-from spacesim.data.records import Camera, as_numbers
+from spacesim.data.records import Camera
 from spacesim.learning.prediction import MaterialView, check_picture
 from spacesim.learning.reflectance import seen_side_normals, unit_normals
 from spacesim.splat.light.material import FittedMaterial

@@ -28,6 +28,7 @@ from spacesim.learning.lights import CanPredict, Light
 from spacesim.learning.prediction import MaterialView, Prediction, check_picture
 from spacesim.learning.record import TrainingRecord
 from spacesim.learning.rendering import Rendering, checked_sun
+from spacesim.learning.tensors import first_not_finite
 from spacesim.splat.light.config import MAX_EXPOSURE
 from spacesim.splat.light.material import FittedMaterial, has_material, read_material
 from spacesim.splat.light.model import LightModel
@@ -378,7 +379,7 @@ def load_run(path: str | Path) -> Run:
             raise ValueError(f"features: expected Gaussians with {light_config.features} each, found {counts}")
     except (KeyError, ValueError) as error:
         raise InputError(f"{model_path}: expected the tensors of a model, found none or others ({error})") from None
-    if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
+    if first_not_finite(tensors):
         raise InputError(f"{model_path}: expected finite numbers, found others; train the run again")
     return Run(path, config, training, gaussians, model_path.stat().st_size, light)
 

@@ -84,12 +84,15 @@ class CameraConfig:
         return length, length
 
     @property
+    def _centre(self) -> tuple[float, float]:
+        """cx and cy, pixels."""
+        return self.principal or (0.5 * self.resolution[0], 0.5 * self.resolution[1])
+
+    @property
     def _sides(self) -> list[tuple[float, float]]:
         """Tangents, without distortion, of the angles from the axis to the left and right, upper and lower border."""
-        centre = self.principal or (0.5 * self.resolution[0], 0.5 * self.resolution[1])
-        return [
-            (-c / f, (side - c) / f) for c, f, side in zip(centre, self.focal_lengths, self.resolution, strict=True)
-        ]
+        lenses = zip(self._centre, self.focal_lengths, self.resolution, strict=True)
+        return [(-c / f, (side - c) / f) for c, f, side in lenses]
 
     @property
     def nearest_border(self) -> float:
@@ -121,8 +124,7 @@ class CameraConfig:
         width, height = self.resolution
         if self.focal is None and self.principal is None:
             return Camera.from_fov(world_from_camera, width, height, self.fov_deg)
-        centre = self.principal or (0.5 * width, 0.5 * height)
-        return Camera(world_from_camera, width, height, *self.focal_lengths, *centre)
+        return Camera(world_from_camera, width, height, *self.focal_lengths, *self._centre)
 
     def _first_fold(self) -> float:
         """Pixels from the optical axis to the nearest of its points that no ray, or more than one, reaches; infinity

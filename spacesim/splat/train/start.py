@@ -1,6 +1,6 @@
 """Where Gaussians start: on a mesh, at points, or at random."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -208,9 +208,7 @@ def sun_warning(dataset: Dataset, iterations: int) -> str:
         lacking.append(f"{iterations} iterations where it takes {MANY_STEPS} or more")
     if len(dataset.train) < MANY_PICTURES:
         lacking.append(f"{len(dataset.train)} training pictures where it takes {MANY_PICTURES} or more")
-    looked_at = dataset.train[:: -(-len(dataset.train) // LOOKED_AT)]
-    bare = sum(not _is_cut_out(load_image(dataset, frame)) for frame in looked_at)
-    if 2 * bare > len(looked_at):
+    if _holds_of_most(dataset, LOOKED_AT, lambda image: not _is_cut_out(image)):
         lacking.append("no silhouette, mask or alpha that separates the object from what is behind it")
     lack = " and ".join(lacking)
     return lack and f"{dataset.root}: expected enough to estimate unknown Suns, found {lack}: they may be far off"
@@ -219,8 +217,7 @@ def sun_warning(dataset: Dataset, iterations: int) -> str:
 def sky_warning(dataset: Dataset) -> str:
     """A sentence where the object stands before a black sky and is not cut out of most pictures: Gaussians then learn
     the sky, as black things around the object; "" elsewhere."""
-    looked_at = dataset.train[:: -(-len(dataset.train) // FEW_LOOKED_AT)]
-    if 2 * sum(_is_before_sky(load_image(dataset, frame)) for frame in looked_at) <= len(looked_at):
+    if not _holds_of_most(dataset, FEW_LOOKED_AT, _is_before_sky):
         return ""
     return (
         f"{dataset.root}: expected the object cut out of its black sky, found no alpha, silhouettes or masks: training "
@@ -237,6 +234,12 @@ def few_left_warning(history: Sequence[Mapping[str, float]]) -> str:
         f"{counts[-1]} Gaussians are left of {max(counts)}: most were pruned before they learned where the object is; "
         "take more iterations, a warm start, or points or a mesh to start from"
     )
+
+
+def _holds_of_most(dataset: Dataset, count: int, holds: Callable[[Image], bool]) -> bool:
+    """Of the training pictures, by `count` of them at most."""
+    looked_at = dataset.train[:: -(-len(dataset.train) // count)]
+    return 2 * sum(holds(load_image(dataset, frame)) for frame in looked_at) > len(looked_at)
 
 
 def _is_before_sky(image: Image) -> bool:
