@@ -6,6 +6,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.packet import numbers_at
 from spacesim.learning.adam import adam_step
 from spacesim.nerf.fields.field import Parameters
 from spacesim.nerf.fields.model import Networks, places
@@ -42,7 +43,7 @@ def step(
     """(parameters, first moments, second moments, loss of the colours) after a step."""
     loss, gradients = loss_and_gradients(networks, parameters, pixels, filled, numbers, proposals_learn)
     first_of_field, count = networks.bounds[1], len(parameters)
-    factors = [dr.gather(ad.Float, numbers.factors, ad.UInt32(i)) for i in range(5)]
+    factors = numbers_at(numbers.factors, range(5))
     parts = [(first_of_field, count, factors[:2])]
     if proposals_learn:  # moments have seen fewer steps than the field's
         parts.insert(0, (0, first_of_field, factors[2:4]))

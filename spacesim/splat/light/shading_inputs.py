@@ -6,6 +6,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Float, TensorXf
+from spacesim.backend.packet import numbers_at
 from spacesim.splat.light.field import FieldInputs
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shadow.light_camera import towards_sun
@@ -38,14 +39,13 @@ class ShadingInputs:
     def refine_items(self, refine: ShadowRefinementConfig, first: int, batch: PaddedBatch) -> TensorXf:
         """Items of the refinement, TensorXf [B, C, m]: 4.11, lengths in training scale. first: of its rows among the
         features"""
-        x, y, z, scale = (dr.gather(ad.Float, self.training_frame, ad.UInt32(i)) for i in range(4))
+        x, y, z, scale = numbers_at(self.training_frame, range(4))
         per_metre = dr.rcp(scale)
         positions = (batch.repeat_last(self.means) - ad.Array3f(x, y, z)) * per_metre
         if refine.positions == "light":
-            axes = [
-                [dr.gather(ad.Float, self.sun.light_axes, ad.UInt32(3 * i + j)) for j in range(3)] for i in range(3)
-            ]
-            positions = ad.Array3f([dr.dot(ad.Array3f(axis), positions) for axis in axes])
+            numbers = numbers_at(self.sun.light_axes, range(9))
+            axes = [ad.Array3f(numbers[i : i + 3]) for i in (0, 3, 6)]
+            positions = ad.Array3f([dr.dot(axis, positions) for axis in axes])
         occlusion, alignment, thickness, bias = (batch.repeat_last(value) for value in self.raw_shadows)
         features = batch.block(self.features, first, refine.features)
         info = [alignment, thickness * per_metre, bias * per_metre]

@@ -6,13 +6,14 @@ gradients with respect to the pose and the intrinsics are those of the array.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float
+from spacesim.backend.packet import evaluates_numbers, numbers_at
 from spacesim.backend.upload import upload_numbers
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
@@ -96,8 +97,16 @@ class Projection(ABC):
         far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
         return dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
 
+    #: `values`, and these one by one, once they were read (`numbers_at`); no field, so no part of what is recorded
+    _read: ClassVar[tuple[Float, list[Float]] | None] = None
+
     def __getitem__(self, index: int) -> Float:
-        return dr.gather(ad.Float, self.values, ad.UInt32(index))
+        """A number of `values`."""
+        if self._read is None or self._read[0] is not self.values:
+            if dr.grad_enabled(self.values) or not evaluates_numbers():
+                return dr.gather(ad.Float, self.values, ad.UInt32(index))
+            self.__dict__["_read"] = self.values, numbers_at(self.values, range(dr.width(self.values)))
+        return self._read[1][index]  # type: ignore[index]
 
     def transform(self, points: Array3f) -> Array3f:
         """Array3f [3, N] world to camera axes, metres (thesis 2.10)."""

@@ -7,6 +7,7 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
+from spacesim.backend.packet import numbers_at
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
 from spacesim.learning.networks.joined import Joined
@@ -195,7 +196,7 @@ def picture_loss(
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
     size = size[0] // times, size[1] // times
-    below = ad.Array3f([dr.gather(ad.Float, target.background, ad.UInt32(c)) for c in range(3)])
+    below = ad.Array3f(numbers_at(target.background, range(3)))
     if config.radiance is not None:
         covered, below = config.radiance * ad.Array3f(truths["radiance"]), decode_srgb(below) / PEAK
     elif config.tone:
@@ -212,7 +213,7 @@ def picture_loss(
         planes, transmittance = pixel_means(planes, transmittance, size, config.supersample, config.tone is not None)
     color = ad.Array3f(planes["color"])
     if gains is not None:
-        color *= ad.Array3f([dr.gather(ad.Float, gains, ad.UInt32(c)) for c in range(3)])
+        color *= ad.Array3f(numbers_at(gains, range(3)))
     picture = dr.select(valid, color + transmittance * below, truth)
     if config.radiance is not None:
         picture, truth = encode_radiance(picture), encode_radiance(truth)

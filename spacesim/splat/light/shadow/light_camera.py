@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Array4f, Bool, Float, Float64
+from spacesim.backend.packet import numbers_at
 from spacesim.backend.upload import upload_numbers
 from spacesim.data.geometry import Array
 from spacesim.data.records import Sun
@@ -147,7 +148,7 @@ def _reduced(batch: PaddedBatch, *parts: tuple[dr.ReduceOp, list[Float64]]) -> l
 
 def _axis(light: Float, i: int) -> Array3f:
     """Array3f of width 1: axis i of `light_rows`."""
-    return ad.Array3f([dr.gather(ad.Float, light, ad.UInt32(3 * i + j)) for j in range(3)])
+    return ad.Array3f(numbers_at(light, range(3 * i, 3 * i + 3)))
 
 
 def drawable_mask(means: Array3f, log_scales: Array3f, quaternions: Array4f, logits: Float) -> Bool:

@@ -11,7 +11,7 @@ from spacesim.backend.upload import upload
 from spacesim.learning.adam import AdamSteps
 from spacesim.splat.raster.gaussians import ROWS, gather_entries
 from spacesim.splat.train.optimizer.packing import (
-    PackedArray,
+    Layout,
     load,
     pack_numpy,
     plan_packing,
@@ -39,9 +39,10 @@ class Adam(AdamSteps):
         self.slices, count = parts(len(rows)), dr.width(rows[0])
         self.source: UInt32 | None = None
         self.arrays: list[list[Float]] = []
-        self.layouts: list[tuple[PackedArray, ...]] = []
+        self.layouts: list[Layout] = []
         self._lay_out(count)
-        self.arrays = [zeros(layout) for layout in self.layouts]
+        sizes = [rows.stop - rows.start for rows in self.slices]
+        self.arrays = [zeros(layout, size, count) for layout, size in zip(self.layouts, sizes, strict=True)]
         self.features = [dr.opaque(ad.Float, 0, dr.width(row)) for row in 2 * rows[self.slices[-1].stop :]]
 
     def take_source(self) -> UInt32 | None:
@@ -75,7 +76,7 @@ class Adam(AdamSteps):
         number = next(i for i, rows in enumerate(self.slices) if rows.start <= row < rows.stop)
         within, layout = row - self.slices[number].start, self.layouts[number]
         first, second = load(self.arrays[number], layout, dr.arange(ad.UInt32, self.count))
-        first[within], second[within] = ad.Float(0), ad.Float(0)
+        first[within], second[within] = (dr.opaque(ad.Float, 0, self.count) for _ in range(2))
         self.arrays[number] = store(first, second, layout)
         dr.eval(self.arrays[number])
 

@@ -16,6 +16,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
+from spacesim.backend.packet import numbers_at
 from spacesim.learning.adam import adam_step
 from spacesim.splat.raster.cameras import Pinhole
 from spacesim.splat.raster.gaussians import ROWS, SH_C0, Gaussians
@@ -24,12 +25,12 @@ from spacesim.splat.raster.render import harmonics, is_unclamped
 from spacesim.splat.raster.surface import flattened
 from spacesim.splat.train.loss.terms import penalty
 from spacesim.splat.train.optimizer.adam import OWN, Adam
-from spacesim.splat.train.optimizer.packing import PackedArray, load, store
+from spacesim.splat.train.optimizer.packing import Layout, load, store
 from spacesim.splat.train.stages import NetworkStep, mean, shape_values, update_light
 
 AT_ONCE = 2**15  #: Gaussians with harmonics, at most, all of whose parts are one recorded function on CUDA
 FULL = 0.95  #: of the power of two to which Dr.Jit rounds rows, at least: all at once then take 1,530 bytes a Gaussian
-Packed = tuple[list[Float], tuple[PackedArray, ...]]  #: moments of a part and how they lie, see `packing`
+Packed = tuple[list[Float], Layout]  #: moments of a part and how they lie, see `packing`
 Learned = tuple[list[Float], list[Float], list[Float]]  #: of networks, see `update_light`
 Observe = Callable[[dict[str, Float], list[Any]], dict[str, Float]]  #: see `Strategy.observe`
 
@@ -300,8 +301,5 @@ def _step(
 def _numbers(factors: Float, first: int, count: int) -> tuple[tuple[Float, Float], list[Float]]:
     """Adam's two corrections, and the step sizes of `count` rows from number `first` on."""
     indices = 0, 1, *range(2 + first, 2 + first + count)
-    numbers = [dr.gather(ad.Float, factors, ad.UInt32(i)) for i in indices]
-    if select() == "llvm":
-        dr.eval(numbers)  # each packet of SIMD lanes would gather them
-    first_correction, second_correction, *rates = numbers
+    first_correction, second_correction, *rates = numbers_at(factors, indices)
     return (first_correction, second_correction), rates

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float
+from spacesim.backend.packet import numbers_at
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.optimizer.adam import Adam
 from spacesim.splat.train.strategies.densify import DensificationCounts
@@ -32,7 +32,7 @@ class OnScreen:
     def measures(self) -> tuple[Float, Float, Bool]:
         """The norm of the gradient by half a picture, the radius as a share of the picture's longer side, and who is in
         the picture, however faint."""
-        half_width, half_height, longer = (dr.gather(ad.Float, self.sizes, ad.UInt32(i)) for i in range(3))
+        half_width, half_height, longer = numbers_at(self.sizes, range(3))
         gradient = dr.sqrt(dr.square(self.absolute_x * half_width) + dr.square(self.absolute_y * half_height))
         return gradient, self.radii / longer, self.radii > 0
 
