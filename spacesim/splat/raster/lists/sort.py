@@ -31,9 +31,11 @@ PACKET = 4  #: numbers that are read at once
 MERGE_THREADS = 2**16  #: that share the entries of lists beyond the longest run: as many as fill a large device
 
 
-def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int) -> UInt32:
+def segment_ids(
+    segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int, order: UInt32 | None = None
+) -> UInt32:
     """Which of `count` segments each slot [P] belongs to, where segment i has those from segment_ends[i - 1] to
-    segment_ends[i]; `count` for slots of no segment."""
+    segment_ends[i]; `count` for slots of no segment. order: where the segments' ends stand, if not one after another"""
     number, wide = type(segment_ends), type(segment_ends)(slot)
     segment, step = ad.UInt32(0), 1
     while WAYS * step <= count:
@@ -42,7 +44,8 @@ def segment_ids(segment_ends: UInt32 | UInt64, slot: UInt32 | UInt64, count: int
         past = ad.UInt32(0)
         for probe in (segment + way * step for way in range(1, WAYS)):
             within = probe <= count
-            reached = within & (dr.gather(number, segment_ends, probe - 1, within) <= wide)
+            place = probe - 1 if order is None else dr.gather(ad.UInt32, order, probe - 1, within)
+            reached = within & (dr.gather(number, segment_ends, place, within) <= wide)
             past += dr.select(reached, ad.UInt32(1), 0)
         segment += past * step
         step //= WAYS
