@@ -73,20 +73,15 @@ def _detached(splats: Splats) -> Splats:
 @recorded
 def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, grid: Grid) -> Boxes:
     """Boxes of `count` splats; pairs are numbered in depth order."""
-    dr.eval(splats, footprints)
-    index = dr.arange(ad.UInt32, capacity)
-    live = index < count
-    live &= dr.gather(ad.Bool, footprints.visible, index, live)
+    dr.schedule(splats, footprints)
+    index = dr.arange(ad.UInt32, dr.width(splats.x))
+    live = footprints.visible & (index < count)
+    seen = Footprints(footprints.half_width, footprints.half_height, live, footprints.order)
+    numbers, pairs_of = find_boxes(splats, seen, grid)
     # Splats that cannot be seen have no pairs, so their place does not matter.
-    key = dr.select(live, dr.gather(ad.UInt32, footprints.order, index, live), ad.UInt32(0xFFFFFFFF))
-    half_width, half_height = (
-        dr.gather(ad.Float, half, index, live) for half in (footprints.half_width, footprints.half_height)
-    )
-    numbers, pairs = find_boxes(
-        Splats(*(dr.gather(ad.Float, values, index, live) for values in vars(splats).values())),
-        Footprints(half_width, half_height, live, key),
-        grid,
-    )
+    pairs, key = dr.zeros(ad.UInt32, capacity), dr.full(ad.UInt32, 0xFFFFFFFF, capacity)
+    dr.scatter(pairs, pairs_of, index)
+    dr.scatter(key, dr.select(live, footprints.order, ad.UInt32(0xFFFFFFFF)), index)
     records = packed(numbers, index, capacity)
     dr.eval(records, pairs, key)
     order = _stable_order(key, 32)
