@@ -78,6 +78,9 @@ class Projection(ABC):
     width: int  #: pixels, of the crop where there is one
     height: int  #: pixels, likewise
 
+    #: `values`, and these one by one, once they were read (`numbers_at`); no field, so no part of what is recorded
+    _read: ClassVar[tuple[Float, list[Float]] | None] = None
+
     @abstractmethod
     def in_reach(self, center: Array3f) -> Bool:
         """Bool [N]: can a Gaussian be drawn whose centre is at `center` (Array3f [3, N], camera axes, metres)?"""
@@ -96,9 +99,6 @@ class Projection(ABC):
         length2 = dr.squared_norm(offset)
         far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
         return dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
-
-    #: `values`, and these one by one, once they were read (`numbers_at`); no field, so no part of what is recorded
-    _read: ClassVar[tuple[Float, list[Float]] | None] = None
 
     def __getitem__(self, index: int) -> Float:
         """A number of `values`."""

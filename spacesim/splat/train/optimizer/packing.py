@@ -79,10 +79,13 @@ def zeros(layout: Layout, pairs: int, count: int) -> list[Float]:
 
 def load(arrays: list[Float], layout: Layout, index: UInt32) -> tuple[list[Float], list[Float]]:
     """The first and the second row of each pair, at entries `index`."""
-    numbers: list[Float] = [dr.gather(ad.Float, row, index) for row in arrays] if layout == PLAIN else []
-    for array, pack in zip(arrays, layout, strict=layout != PLAIN):
-        for size, first in pack.packets():
-            numbers += list(gather_packet(array, index + first, size))
+    numbers: list[Float] = []
+    if layout == PLAIN:
+        numbers = [dr.gather(ad.Float, row, index) for row in arrays]
+    else:
+        for array, pack in zip(arrays, layout, strict=True):
+            for size, first in pack.packets():
+                numbers += list(gather_packet(array, index + first, size))
     return numbers[::2], numbers[1::2]
 
 
@@ -105,11 +108,14 @@ def store(first_moments: list[Float], second_moments: list[Float], layout: Layou
 
 def unpack_numpy(arrays: list[Float], layout: Layout, count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """`load` of the first `count` entries, without Dr.Jit: float32 [count] each."""
-    numbers: list[np.ndarray] = [np.array(row) for row in arrays] if layout == PLAIN else []
-    for array, pack in zip(arrays, layout, strict=layout != PLAIN):
-        values = np.array(array)
-        for size, first in pack.packets():
-            numbers += list(values[first * size : (first + count) * size].reshape(count, size).T.copy())
+    numbers: list[np.ndarray] = []
+    if layout == PLAIN:
+        numbers = [np.array(row) for row in arrays]
+    else:
+        for array, pack in zip(arrays, layout, strict=True):
+            values = np.array(array)
+            for size, first in pack.packets():
+                numbers += list(values[first * size : (first + count) * size].reshape(count, size).T.copy())
     return numbers[::2], numbers[1::2]
 
 
