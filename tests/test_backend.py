@@ -522,14 +522,15 @@ def test_device_memory_falls_with_what_is_taken():
     import drjit as dr
 
     before = backend.free_memory(10**18)
-    array = dr.opaque(backend.ad.Float, 0, 2**28)
+    taken = 1 << (before // 8).bit_length() - 1  # far more than other processes take or give back meanwhile
+    array = dr.opaque(backend.ad.Float, 0, taken // 4)
     dr.eval(array)
     dr.sync_thread()
     left = backend.device_memory()
     assert left is not None
-    assert before - left >= 2**30 - 2**20
+    assert before - left >= 0.8 * taken
     del array
-    assert backend.free_memory(10**18) > left + 2**29
+    assert backend.free_memory(10**18) > left + 0.8 * taken
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is protected by Linux's calls")
