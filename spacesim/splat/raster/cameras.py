@@ -78,8 +78,7 @@ class Projection(ABC):
     width: int  #: pixels, of the crop where there is one
     height: int  #: pixels, likewise
 
-    #: `values`, and these one by one, once they were read (`numbers_at`); no field, so no part of what is recorded
-    _read: ClassVar[tuple[Float, list[Float]] | None] = None
+    _numbers: ClassVar[list[Float]] = []  #: `values` one by one, of `evaluated` cameras
 
     @abstractmethod
     def in_reach(self, center: Array3f) -> Bool:
@@ -95,18 +94,23 @@ class Projection(ABC):
 
     def directions_to(self, points: Array3f) -> Array3f:
         """Array3f [3, N]: unit vectors along `rays_to`; (0, 0, 1), without gradient, where there is no direction."""
-        offset = self.rays_to(points)
+        offset = self.evaluated().rays_to(points)
         length2 = dr.squared_norm(offset)
         far = dr.detach((length2 > 1e-20) & (length2 < 1e20))
         return dr.select(far, offset * dr.rsqrt(dr.select(far, length2, 1)), ad.Array3f(0, 0, 1))
 
+    def evaluated(self: Self) -> Self:
+        """A copy for use on the spot, whose numbers a kernel need not gather, where they have no gradients
+        (`evaluates_numbers`); what is changed in `values` afterwards does not reach it."""
+        if dr.grad_enabled(self.values) or not evaluates_numbers():
+            return self
+        camera = replace(self)
+        vars(camera)["_numbers"] = numbers_at(self.values, range(dr.width(self.values)))
+        return camera
+
     def __getitem__(self, index: int) -> Float:
         """A number of `values`."""
-        if self._read is None or self._read[0] is not self.values:
-            if dr.grad_enabled(self.values) or not evaluates_numbers():
-                return dr.gather(ad.Float, self.values, ad.UInt32(index))
-            self.__dict__["_read"] = self.values, numbers_at(self.values, range(dr.width(self.values)))
-        return self._read[1][index]  # type: ignore[index]
+        return self._numbers[index] if self._numbers else dr.gather(ad.Float, self.values, ad.UInt32(index))
 
     def transform(self, points: Array3f) -> Array3f:
         """Array3f [3, N] world to camera axes, metres (thesis 2.10)."""

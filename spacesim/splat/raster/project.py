@@ -83,6 +83,7 @@ def project_ellipsoids(
     spread: pixels^2 added to the screen-space covariance, a number or Float [N]
     compensated: whether what that adds to a splat's area is taken from its opacity; True, False or Bool [N]
     """
+    camera = camera.evaluated()
     center = camera.transform(means)
     sane &= dr.detach(camera.in_reach(center))
     center = dr.select(sane, center, ad.Array3f(0, 0, 1))

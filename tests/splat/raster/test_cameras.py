@@ -313,3 +313,23 @@ def test_the_public_render_takes_a_motion_and_a_camera_of_arrays():
     np.testing.assert_array_equal(
         ss.render(model, Pinhole.of(view)).image("color"), ss.render(model, view).image("color")
     )
+
+
+def test_a_camera_that_was_read_follows_its_values():
+    """Nothing that a projection reads of a camera may outlive it: neither gradients nor changes would arrive."""
+    pose = look_at([2.5, 0.8, 0.6], [0.0, 0.0, 0.0])
+    camera = Pinhole.of(Camera.from_fov(pose, 24, 16, 40))
+    point = ad.Array3f([0.1, 0.2], [0.3, 0.0], [0.2, 0.1])
+    gaussians = Gaussians.from_numpy(random_splats(50, 0, degree=0))
+    dr.enable_grad(gaussians.means)
+    project(gaussians, camera)
+    camera.directions_to(point)
+    before = float(camera[12][0])
+    camera.values += 1
+    assert float(camera[12][0]) == before + 1
+    dr.enable_grad(camera.values)
+    splats, _ = project(gaussians, camera)
+    dr.backward(dr.sum(splats.x) + dr.sum(camera.directions_to(point).x))
+    gradient = np.array(dr.grad(camera.values))
+    assert np.all(gradient[[12, 14]] != 0)
+    assert np.all(gradient[:4] != 0)
