@@ -4,7 +4,7 @@ Both write what torch gets row by row themselves: a direction is one call.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 
@@ -74,6 +74,9 @@ class LeafGradients:
     intrinsics: list[Float] | None = None  #: fx, fy, cx, cy
 
 
+Camera = TypeVar("Camera", bound="_NearFarPlanes")
+
+
 @dataclass
 class _NearFarPlanes(Projection):
     """Between a near and a far plane, metres. `values` stay unread: to put numbers that are computed side by side takes
@@ -88,6 +91,10 @@ class _NearFarPlanes(Projection):
 
     def __getitem__(self, index: int) -> Float:
         return self.numbers[index]
+
+    def evaluated(self: Camera) -> Camera:
+        """The camera itself: its numbers are in no array."""
+        return self
 
     def in_reach(self, center: Array3f) -> Bool:
         return (center.z > self.near) & (center.z < self.far) & (dr.max(dr.abs(center)) < MAX_MAGNITUDE)
