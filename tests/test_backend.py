@@ -521,16 +521,20 @@ def test_device_memory_falls_with_what_is_taken():
         pytest.skip("needs a CUDA device")
     import drjit as dr
 
-    before = backend.free_memory(10**18)
-    taken = 1 << (before // 8).bit_length() - 1  # far more than other processes take or give back meanwhile
-    array = dr.opaque(backend.ad.Float, 0, taken // 4)
-    dr.eval(array)
-    dr.sync_thread()
-    left = backend.device_memory()
-    assert left is not None
-    assert before - left >= 0.8 * taken
-    del array
-    assert backend.free_memory(10**18) > left + 0.8 * taken
+    taken = 1 << (backend.free_memory(10**18) // 8).bit_length() - 1  # far more than others take meanwhile
+    for _ in range(20):  # others may give memory back just then
+        before = backend.free_memory(10**18)
+        array = dr.opaque(backend.ad.Float, 0, taken // 4)
+        dr.eval(array)
+        dr.sync_thread()
+        left = backend.device_memory()
+        assert left is not None
+        del array
+        after = backend.free_memory(10**18)
+        if before - left >= taken - 2**20:
+            break
+    assert before - left >= taken - 2**20
+    assert after > left + taken // 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is protected by Linux's calls")

@@ -4,13 +4,13 @@ Both write what torch gets row by row themselves: a direction is one call.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, Bool, Float, Int32
-from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic, Pinhole, Projection
+from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Orthographic, Pinhole, Projection, Self
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Footprints, Splats, project_ellipsoids
 from spacesim.splat.raster.render import harmonics, is_unclamped
@@ -74,9 +74,6 @@ class LeafGradients:
     intrinsics: list[Float] | None = None  #: fx, fy, cx, cy
 
 
-Camera = TypeVar("Camera", bound="_NearFarPlanes")
-
-
 @dataclass
 class _NearFarPlanes(Projection):
     """Between a near and a far plane, metres. `values` stay unread: to put numbers that are computed side by side takes
@@ -92,7 +89,7 @@ class _NearFarPlanes(Projection):
     def __getitem__(self, index: int) -> Float:
         return self.numbers[index]
 
-    def evaluated(self: Camera) -> Camera:
+    def evaluated(self: Self) -> Self:
         """The camera itself: its numbers are in no array."""
         return self
 

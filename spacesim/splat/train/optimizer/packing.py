@@ -53,8 +53,8 @@ PLAIN: Layout = ()  #: rows as they are, [N] each
 
 def plan_packing(pairs: int, count: int) -> Layout:
     """The arrays for `pairs` pairs of rows of `count` Gaussians that take the least memory, large ones first; of equals
-    the fewest. Up to `SMALL` Gaussians the same for all up to a power of two, as large as single rows would be. On LLVM
-    `PLAIN` where rows take no more."""
+    the fewest. On LLVM `PLAIN` where rows take no more, as those of up to `SMALL` Gaussians; on CUDA these have the
+    same arrays up to each power of two, as large as single rows would be."""
     plan = _least(pairs, count)
     of_rows = 2 * pairs << (max(count, 1) - 1).bit_length()
     return PLAIN if select() == "llvm" and sum(pack.size for pack in plan) >= of_rows else plan
