@@ -49,8 +49,9 @@ def run(options: argparse.Namespace) -> None:
     failed = f", {done.failed} without a pose" if done.failed else ""
     interrupts.print_output(f"{options.out}: {done.pictures} pictures, {done.converged} converged{failed}")
     if done.failed == done.pictures:
+        others = "" if done.failed == 1 else f" (the others: {options.out})"
         raise WorkError(
-            f"{options.images}: expected a picture with a pose to be found, found none; {options.out} says why"
+            f"{options.images}: expected a picture with a pose to be found, found none: {done.reason}{others}"
         )
 
 

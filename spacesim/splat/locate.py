@@ -34,6 +34,7 @@ class Located:
     pictures: int  #: in all
     converged: int  #: of which the pose may be trusted
     failed: int  #: that have no pose
+    reason: str = ""  #: why the first of these has none
 
 
 def locate(
@@ -101,7 +102,8 @@ def locate(
     finally:
         _write(out, settings, entries)
     trusted = sum(bool(entry.get("converged")) for entry in entries.values())
-    return Located(len(frames), trusted, sum("failed" in entry for entry in entries.values()))
+    reasons = [f"{name}: {entry['failed']}" for name, entry in entries.items() if "failed" in entry]
+    return Located(len(frames), trusted, len(reasons), reasons[0] if reasons else "")
 
 
 def _frames(

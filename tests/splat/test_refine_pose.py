@@ -114,6 +114,14 @@ def test_exposure_and_background_are_free(run):
     pose = refine_pose(run, over, moved(CAMERA, [0.02, -0.02, 0.03, 0.05, -0.05, 0.05]))
     assert pose.gain == pytest.approx(0.7, abs=0.01)
     assert max(errors(pose.camera)) < 0.05
+    assert pose.converged
+
+
+def test_an_exposure_at_its_bound_is_not_trusted(run):
+    pose = refine_pose(run, 0.48 * picture(run), off(0), **ALONE)
+    assert pose.gain == 0.5
+    assert max(errors(pose.camera)) < 0.5
+    assert not pose.converged
 
 
 def test_what_is_masked_does_not_count(run):

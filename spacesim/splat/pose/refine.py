@@ -21,7 +21,7 @@ from spacesim.data.structure import checked
 from spacesim.learning.rendering import checked_sun
 from spacesim.splat.pose.covariance import uncertainty
 from spacesim.splat.pose.motion import Pivot
-from spacesim.splat.pose.picture import SunlitRun, background_of, checked_picture, first_gain
+from spacesim.splat.pose.picture import GAINS, SunlitRun, background_of, checked_picture, first_gain
 from spacesim.splat.pose.solver import BLURS, REACH, PyramidLevel, State
 from spacesim.splat.run import Predictor, check_gaussians, check_picture
 
@@ -30,7 +30,7 @@ ENOUGH = 0.05, 0.005  #: pixels: shorter steps end a coarse level, and the fines
 ITERATIONS = 20  #: steps on a level at most
 CANDIDATES = 128  #: random poses that are looked at for starts
 FIRST_ITERATIONS = 4  #: steps that every start gets before the best goes on
-NEARLY = 0.95  #: of `REACH`: a pose beyond is at it
+NEARLY = 0.95  #: of `REACH` and of `GAINS`: what is beyond is at the bound
 EXPLAINED = (
     0.09  #: of the model's apparent radius: a shift; what is left of errors at a trusted pose is below those of it
 )
@@ -87,10 +87,10 @@ def refine_pose(
     the picture where the model is not. What is not so, stars or the Earth, is an outlier (Cauchy's loss); mask it if it
     is large. Colours that depend on the view are computed anew before each step and count as given within it.
 
-    `converged` is True where steps had become shorter than a tenth of a pixel, the pose is not at the bound (off by
-    less than 1.9 times `within`), and what is left of errors is smaller than what a shift by 9 % of the model's
-    apparent radius makes, both smoothed over 8 % of it: a wrong pose or another object leaves more, noise of pixels
-    does not. What is dark before a dark sky cannot be seen: then it is often False.
+    `converged` is True where steps had become shorter than a tenth of a pixel, the pose is not at its bound (off by
+    less than 1.9 times `within`), nor the exposure at its own (0.53 to 1.9), and what is left of errors is smaller than
+    what a shift by 9 % of the model's apparent radius makes, both smoothed over 8 % of it: a wrong pose or another
+    object leaves more, noise of pixels does not. What is dark before a dark sky cannot be seen: then it is often False.
 
     Raises InputError where the picture, the mask or the numbers are not as above, where the run needs a Sun and none is
     given, and where the camera does not see the model.
@@ -118,7 +118,8 @@ def refine_pose(
         state = level.solve(state, ITERATIONS, ENOUGH[level.factor == 1 and level.blur == 0])
         taken += state.iterations
     covariance, error, shift = uncertainty(levels[-1], state)
-    trusted = state.converged and pivot.reach(state.camera) < NEARLY * REACH and shift < EXPLAINED
+    is_within = pivot.reach(state.camera) < NEARLY * REACH and GAINS[0] / NEARLY < state.gain < NEARLY * GAINS[1]
+    trusted = state.converged and is_within and shift < EXPLAINED
     return RefinedPose(state.camera, covariance, state.gain, error, trusted, taken)
 
 
