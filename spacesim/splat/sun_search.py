@@ -38,6 +38,9 @@ ERROR = 0.05  #: sRGB values, or roots of linear ones: an error so large counts 
 DRAWN = 16  #: Suns whose pictures are drawn at once: Gaussians are projected and sorted once for all of them
 GRANULES = 4  #: steps to the longer side, of which the sides of small pictures are multiples
 BLOCKS = 512  #: parts of a small picture of SIDE x SIDE pixels whose errors count as one each
+#: blocks whose errors are one, as a model is wrong in one way over several: with it the root mean square of errors over
+#: `sigma_deg` was 0.96 for 30 unseen pictures of a model trained for 2,000 steps, 1.26 for 8 of one trained for 800
+ALIKE = 2.5
 LEAST = 30  #: pixels of a half of a picture that tells of a Sun
 COVERED = 0.5  #: least alpha of a pixel that counts
 AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
@@ -54,8 +57,8 @@ class SunEstimate:
     """A Sun's direction by a picture."""
 
     direction: Array  #: [3] unit, world axes, towards the Sun
-    #: degrees: root mean square angle to the other Suns that would do, by how well they do. Of a model that is wrong as
-    #: a whole it says nothing: a lower bound
+    #: degrees: root mean square angle to the other Suns that would do, by how well they do. It suits models trained to
+    #: the end; errors of those trained less, or of other pictures than those they learned from, may be larger
     sigma_deg: float
     loss: float  #: of Cauchy, summed over blocks of pixels, lower is better
 
@@ -259,8 +262,8 @@ def lowest_between(places: Array, losses: Array) -> float:
 
 
 def spread(directions: Array, losses: Array) -> float:
-    """Degrees: root mean square angle to the best of directions [K, 3], weighted by exp(-loss)."""
-    likely = np.exp(-(losses - losses.min()))
+    """Degrees: root mean square angle to the best of directions [K, 3], weighted by exp(-loss / `ALIKE`)."""
+    likely = np.exp(-(losses - losses.min()) / ALIKE)
     angles = degrees_between(directions @ directions[int(np.argmin(losses))])
     return float(np.sqrt((likely * angles**2).sum() / likely.sum()))
 

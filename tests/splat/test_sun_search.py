@@ -79,6 +79,13 @@ def test_the_lowest_place_of_a_paraboloid_is_found():
     np.testing.assert_array_equal(flat, best)
 
 
+def test_how_sure_a_sun_is():
+    """On a plane in closed form: of exp(-(angle / s)^2 / 2 / ALIKE), angles squared are 2 ALIKE s^2."""
+    sphere = fibonacci_sphere(40_000)
+    losses = 7.0 + 0.5 * (np.degrees(np.arccos(np.clip(sphere @ sphere[123], -1, 1))) / 2.0) ** 2
+    assert sun_search.spread(sphere, losses) == pytest.approx(2 * np.sqrt(2 * sun_search.ALIKE), rel=0.01)
+
+
 def test_a_smooth_path_passes_over_a_picture_that_misleads():
     sphere = fibonacci_sphere(60)
     true = sphere[7]
