@@ -80,6 +80,8 @@ class TrajectoryRig(Rig):
         motion = self.motion()
         if motion.sun is not None and self.sun:
             raise InputError(f"sun: expected none beside the trajectory's own, found {list(self.sun[0])}")
+        if motion.sun is None and not self.sun:
+            _tell_of_default_sun("the trajectory's world frame")
         return self._views_at(motion, self._times(motion), target, camera)
 
     def _times(self, motion: Motion) -> tuple[Array, Array]:
@@ -163,6 +165,10 @@ def planned_views(
     ]
 
 
+def _tell_of_default_sun(frame: str) -> None:
+    _log.warning("rig: no sun is given; it stands at azimuth %g, elevation %g degrees in %s", *SINGLE_SUN, frame)
+
+
 def check_exposures(exposures: Array | None) -> None:
     """Raise InputError where one of them [N] is out of range."""
     least, most = EXPOSURES
@@ -212,7 +218,8 @@ class PoseRig(Rig):
     """Cameras of your own, as arrays: `ss.generate("boxsat", "data", rig=ss.PoseRig(poses, sun=(40, 25)))`.
 
     world_from_camera: [N, 4, 4], OpenCV axes, metres
-    sun: (azimuth, elevation) in degrees [2], a direction [3] or a `Sun`; or one for each pose, N of a form
+    sun: (azimuth, elevation) in degrees [2], a direction [3] or a `Sun`; or one for each pose, N of a form; None:
+        (45, 35), which is logged
     test: world_from_camera [M, 4, 4] of testing
     test_sun: as `sun`, of these; None: as `sun`
     time: [N] seconds, written with the frames
@@ -222,7 +229,7 @@ class PoseRig(Rig):
     """
 
     world_from_camera: "ArrayLike"  #: [N, 4, 4]
-    sun: "ArrayLike | Sun | Sequence[Sun]" = SINGLE_SUN  #: one, or one for each pose
+    sun: "ArrayLike | Sun | Sequence[Sun] | None" = None  #: one, or one for each pose
     test: "ArrayLike" = ()  #: [M, 4, 4]
     test_sun: "ArrayLike | Sun | Sequence[Sun] | None" = None  #: as `sun`
     time: "ArrayLike | None" = None  #: [N] seconds
@@ -241,6 +248,8 @@ class PoseRig(Rig):
 
     def views_of(self, target: TargetSphere, camera: CameraConfig, seed: int) -> Views:
         poses, suns = self._poses("world_from_camera", self.world_from_camera), self._suns(False)
+        if self.sun is None:
+            _tell_of_default_sun("the world frame")
         times, exposures = self._numbers("time", self.time), self._numbers("exposure", self.exposure)
         views = [
             PlannedView(
@@ -274,7 +283,7 @@ class PoseRig(Rig):
         return poses
 
     def _suns(self, test: bool) -> list[Sun]:
-        name, value = ("sun", self.sun)
+        name, value = "sun", SINGLE_SUN if self.sun is None else self.sun
         count = len(self._poses("test", self.test)) if test else len(self._poses("", self.world_from_camera))
         if test and self.test_sun is not None:
             name, value = "test_sun", self.test_sun

@@ -233,6 +233,18 @@ def test_without_an_attitude_the_camera_looks_at_the_target(tmp_path):
         assert (view.earth, view.exposure) == (None, None)
 
 
+def test_a_trajectory_without_a_sun_says_where_it_stands(table, tmp_path, caplog):
+    path = write(tmp_path / "p.csv", [[9, 0, 0]], ["camera_x_m", "camera_y_m", "camera_z_m"])
+    train, _ = plan(FileRig(path=str(path)), TARGET, CAMERA, 0)
+    assert train[0].sun.angles == pytest.approx((45, 35))
+    expected = "rig: no sun is given; it stands at azimuth 45, elevation 35 degrees in the trajectory's world frame"
+    assert [record.getMessage() for record in caplog.records] == [expected]
+    caplog.clear()
+    plan(FileRig(path=str(path), sun=((45.0, 35.0),)), TARGET, CAMERA, 0)
+    plan(FileRig(path=str(table)), TARGET, CAMERA, 0)
+    assert caplog.records == []
+
+
 def test_a_target_seen_from_a_camera_that_stands_still(tmp_path):
     """Labels of pose estimation: the target's pose in camera axes; half a turn about x makes OpenGL's OpenCV's."""
     names = ["target_x_m", "target_y_m", "target_z_m", *(f"world_from_target_q{axis}" for axis in "wxyz")]

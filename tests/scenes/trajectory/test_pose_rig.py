@@ -66,6 +66,19 @@ def test_suns_are_taken_in_every_form(tmp_path):
         ss.read_scene("boxsat", sun=(0, 0, 0))
 
 
+def test_poses_without_a_sun_say_where_it_stands(caplog):
+    camera = ss.read_scene("boxsat").camera
+    views, tests = ss.PoseRig(POSES, test=POSES[:1]).views_of(None, camera, 0)
+    assert [view.sun.angles for view in (*views, *tests)] == [pytest.approx((45, 35))] * 5
+    expected = "rig: no sun is given; it stands at azimuth 45, elevation 35 degrees in the world frame"
+    assert [record.getMessage() for record in caplog.records] == [expected]
+    given = ss.PoseRig(POSES, sun=(45, 35), test=POSES[:1])
+    assert given.to_json() == ss.PoseRig(POSES, test=POSES[:1]).to_json()
+    caplog.clear()
+    given.views_of(None, camera, 0)
+    assert caplog.records == []
+
+
 @dataclass(frozen=True)
 class Corkscrew(Rig):
     turns: float = 2.0
