@@ -59,12 +59,14 @@ def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[st
     """
     empty = [name for name, share in sunlit.items() if share is None]
     dark = [name for name, share in sunlit.items() if share is not None and share < DARK]
-    words = []
+    words, hints = [], [hint] if dark and hint else []
     if dark:
         behind = sum(eclipsed.get(name, False) for name in dark)
         why = f", in {behind} of them the Earth hides the Sun" if behind else ""
         words.append(f"{len(dark)} of {len(sunlit)} frames show the object in the dark ({dark[0]} first{why})")
     if empty:
         words.append(f"{len(empty)} of {len(sunlit)} frames show no object ({empty[0]} first)")
+    if len(empty) == len(sunlit):
+        hints = ["check which way attitudes turn, and whether lengths are in m or km"]
     if words:
-        _log.warning("generate: %s", "; ".join([*words, *([hint] if dark and hint else [])]))
+        _log.warning("generate: %s", "; ".join([*words, *hints]))

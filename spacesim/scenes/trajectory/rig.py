@@ -182,7 +182,9 @@ class FileRig(TrajectoryRig):
     """A trajectory of files: a table (docs/how-to/trajectory.md), CCSDS messages, or both, which then add up."""
 
     path: str = ""  #: a table, .csv, .json or .parquet; this and the others are relative to the scene file
-    camera: tuple[str, ...] = ()  #: CCSDS messages of what carries the camera: an OEM, an AEM or both
+    #: CCSDS messages of what carries the camera: an OEM, an AEM or both. Quaternions of an AEM turn the axes of its
+    #: REF_FRAME_A into those of REF_FRAME_B (ATTITUDE_DIR B2A: back), scalar last unless QUATERNION_TYPE is FIRST
+    camera: tuple[str, ...] = ()
     target: tuple[str, ...] = ()  #: CCSDS messages of the target
 
     def __post_init__(self) -> None:

@@ -304,6 +304,12 @@ def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
     ]
     frames = json.loads((tmp_path / "data/transforms.json").read_text())["frames"]
     assert [frame["sunlit_fraction"] for frame in frames] == [pytest.approx(0.8, abs=0.2), 0.0, None]
+    caplog.clear()
+    generate(replace(config, rig=PoseRig(np.array(poses[2:]), sun=(0, 0))), tmp_path / "empty")
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [
+        "generate: 1 of 1 frames show no object (train_00000 first); check which way attitudes turn, and whether "
+        "lengths are in m or km"
+    ]
 
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)
