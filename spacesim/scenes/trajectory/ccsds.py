@@ -24,7 +24,7 @@ from spacesim.data.geometry import Array
 from spacesim.scenes.trajectory.ephemeris import J2000_FRAMES, sun_direction
 from spacesim.scenes.trajectory.epochs import read_epochs
 from spacesim.scenes.trajectory.motion import DAY, Motion, merge
-from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track
+from spacesim.scenes.trajectory.tracks import Attitude, Direction, Track, place_of
 
 QUATERNIONS = ("QUATERNION", "QUATERNION/DERIVATIVE", "QUATERNION/RATE", "QUATERNION/ANGVEL")
 """Attitude types whose lines begin with a quaternion."""
@@ -50,12 +50,14 @@ class Message:
     day: int  #: from whose midnight times count, a proleptic ordinal
     times: Array  #: [N] seconds
     values: Array  #: [N, 6] metres and metres a second, or [N, 4] quaternions (w, x, y, z), world_from_body
+    lines: Sequence[int] = ()  #: [N] of the file, of KVN
 
 
 @dataclass
 class _Segment:
     meta: dict[str, str] = field(default_factory=dict)
     lines: list[list[str]] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)  #: of the lines in the file, of KVN
 
 
 def motion_of(messages: Mapping[str, Sequence[Path]], with_sun: bool = True) -> Motion:
@@ -101,9 +103,9 @@ def _distinct(ends: Array) -> Array:
 
 def _motion(message: Message, body: str) -> Motion:
     if message.kind == "OEM":
-        track = Track(str(message.path), message.times, message.values[:, :3], message.values[:, 3:])
+        track = Track(str(message.path), message.times, message.values[:, :3], message.values[:, 3:], message.lines)
         return Motion(message.day, message.time_system, **{body: track})  # type: ignore[arg-type]
-    turn = Attitude(str(message.path), message.times, message.values)
+    turn = Attitude(str(message.path), message.times, message.values, message.lines)
     return Motion(message.day, message.time_system, **{f"{body}_turn": turn})  # type: ignore[arg-type]
 
 
@@ -134,9 +136,9 @@ def _message(path: Path, text: str) -> Message:
         if attitude not in QUATERNIONS:
             raise InputError(f"ATTITUDE_TYPE: expected one of {', '.join(QUATERNIONS)}, found {attitude}")
     _tell_of_interpolation(path, kind, segments)
-    day, times, values = 0, np.empty(0), np.empty((0, 6 if is_orbit else 4))
+    day, times, values, lines = 0, np.empty(0), np.empty((0, 6 if is_orbit else 4)), list[int]()
     for number, segment in enumerate(segments):
-        of_segment, seconds = read_epochs([line[0] for line in segment.lines], "epoch")
+        of_segment, seconds = read_epochs([line[0] for line in segment.lines], "epoch", segment.numbers)
         day = of_segment if number == 0 else day
         seconds = seconds + DAY * (of_segment - day)
         numbers = _numbers(segment, 7 if is_orbit else 5)
@@ -145,9 +147,10 @@ def _message(path: Path, text: str) -> Message:
             how = "overlap" if seconds[0] < times[-1] else "leave a gap"
             raise InputError(f"expected segments of which each begins where the last one ends, found two that {how}")
         keep = len(times) - bool(number)
+        lines = [*lines[:keep], *segment.numbers]
         times, values = np.concatenate([times[:keep], seconds]), np.concatenate([values[:keep], numbers])
     _warn_of_missing_data(path, segments[-1].meta, day, times[-1])
-    return Message(path, kind, known[0], systems[0], centers[0], day, times, values)
+    return Message(path, kind, known[0], systems[0], centers[0], day, times, values, lines)
 
 
 def _tell_of_interpolation(path: Path, kind: str, segments: Sequence[_Segment]) -> None:
@@ -216,7 +219,7 @@ def _segments(text: str) -> Iterator[_Segment]:
     """Segments of a message in KVN; comments and covariances are passed over."""
     segment: _Segment | None = None
     place = "header"
-    for line in text.splitlines():
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0] == "COMMENT":
             continue
@@ -233,6 +236,7 @@ def _segments(text: str) -> Iterator[_Segment]:
             segment.meta[key.strip()] = value.strip()
         elif place == "data" and segment is not None:
             segment.lines.append(words)
+            segment.numbers.append(number)
     if segment is not None:
         yield segment
 
@@ -266,10 +270,14 @@ def _world_from_body(meta: Mapping[str, str], numbers: Array) -> Array:
 
 def _numbers(segment: _Segment, count: int) -> Array:
     """[N, count - 1] of the data lines, whose first word is the epoch."""
-    for line in segment.lines:
+    rows = []
+    for row, line in enumerate(segment.lines):
         if len(line) < count:
-            raise InputError(f"expected an epoch and {count - 1} numbers, found {' '.join(line)[:80]!r}")
-    try:
-        return np.array([[float(word) for word in line[1:count]] for line in segment.lines])
-    except ValueError as error:
-        raise InputError(f"expected numbers in every line of data, found another word ({error})") from None
+            found = f"{' '.join(line)[:80]!r} in {place_of(row, segment.numbers)}"
+            raise InputError(f"expected an epoch and {count - 1} numbers, found {found}")
+        try:
+            rows.append([float(word) for word in line[1:count]])
+        except ValueError as error:
+            place = place_of(row, segment.numbers)
+            raise InputError(f"expected numbers in {place}, found another word ({error})") from None
+    return np.array(rows)

@@ -8,25 +8,26 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array
+from spacesim.scenes.trajectory.tracks import place_of
 
 _EPOCH = re.compile(r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))[T ](\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)(?:Z|\+00:00)?")
 
 
-def read_epochs(texts: Sequence[object], name: str) -> tuple[int, Array]:
+def read_epochs(texts: Sequence[object], name: str, lines: Sequence[int] = ()) -> tuple[int, Array]:
     """(day of the first, a proleptic ordinal; seconds [N] since its midnight) of epochs such as 2030-03-01T12:00:00.25
     or 2030-060T12:00:00.
 
-    A day has 86,400 seconds: a leap second between two epochs is not counted. name: for errors. Raises InputError for a
-    text that is no epoch.
+    A day has 86,400 seconds: a leap second between two epochs is not counted. name: for errors; lines: [N] where the
+    texts stand in a file, for errors. Raises InputError for a text that is no epoch.
     """
-    parsed = [_read_epoch(str(text).strip(), name, row) for row, text in enumerate(texts, start=1)]
+    parsed = [_read_epoch(str(text).strip(), name, row, lines) for row, text in enumerate(texts)]
     if not parsed:
         raise InputError(f"{name}: expected at least one epoch, found none")
     day = parsed[0][0]
     return day, np.array([86_400.0 * (days - day) + seconds for days, seconds in parsed])
 
 
-def _read_epoch(text: str, name: str, row: int) -> tuple[int, float]:
+def _read_epoch(text: str, name: str, row: int, lines: Sequence[int]) -> tuple[int, float]:
     """(day, seconds since its midnight)."""
     match = _EPOCH.fullmatch(text)
     try:
@@ -43,5 +44,5 @@ def _read_epoch(text: str, name: str, row: int) -> tuple[int, float]:
             raise ValueError
     except (ValueError, OverflowError):
         expected = "an epoch such as 2030-03-01T12:00:00.000"
-        raise InputError(f"{name}: expected {expected}, found {text[:60]!r} in row {row}") from None
+        raise InputError(f"{name}: expected {expected}, found {text[:60]!r} in {place_of(row, lines)}") from None
     return ordinal, 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds)

@@ -15,7 +15,7 @@ import numpy as np
 
 from spacesim.data.errors import InputError
 from spacesim.data.geometry import Array, look_at, normalize
-from spacesim.scenes.trajectory.tracks import Attitude, Track
+from spacesim.scenes.trajectory.tracks import Attitude, Track, place_of
 
 _log = logging.getLogger(__name__)
 
@@ -50,8 +50,8 @@ class Motion:
     def __post_init__(self) -> None:
         for track in (self.camera, self.target, self.earth, *self.bodies.values()):
             if isinstance(track, Track):
-                _check_size(track.name, track.values, MAX_PLACE, "m")
-                _check_size(track.name, track.values[:0] if track.rates is None else track.rates, MAX_SPEED, "m/s")
+                _check_size(track, track.values, MAX_PLACE, "m")
+                _check_size(track, track.values[:0] if track.rates is None else track.rates, MAX_SPEED, "m/s")
 
     @property
     def tracks(self) -> dict[str, Track | Attitude]:
@@ -98,13 +98,14 @@ class Motion:
         return f"{day.isoformat()}T{minutes // 60:02d}:{minutes % 60:02d}:{micro / 1e6:09.6f}"
 
 
-def _check_size(name: str, values: Array, most: float, unit: str) -> None:
-    """Raise InputError where one of `values` [N, 3] is beyond `most`."""
+def _check_size(track: Track, values: Array, most: float, unit: str) -> None:
+    """Raise InputError where one of its `values` [N, 3] is beyond `most`."""
     beyond = (np.abs(values) > most).any(axis=1)
     if beyond.any():
         row = int(beyond.argmax())
         expected = f"up to {most:g} {unit} along an axis"
-        raise InputError(f"{name}: expected {expected}, found {values[row].tolist()} in row {row + 1}")
+        found = f"{values[row].tolist()} in {place_of(row, track.lines)}"
+        raise InputError(f"{track.name}: expected {expected}, found {found}")
 
 
 @dataclass(frozen=True, eq=False)

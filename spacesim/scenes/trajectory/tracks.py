@@ -1,6 +1,7 @@
 """What is known at some times, and its values between them."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +29,15 @@ class Track:
     times: Array  #: [N] seconds
     values: Array  #: [N, C]
     rates: Array | None = None  #: [N, C] a second
+    lines: Sequence[int] = ()  #: [N] where they stand in a file, for errors; (): rows are counted
 
     def __post_init__(self) -> None:
-        check_times(self.times, self.name)
+        check_times(self)
         for values in (self.values, self.rates):
             if values is not None and not np.isfinite(values).all():
                 row = int((~np.isfinite(values)).any(axis=1).argmax())
-                raise InputError(f"{self.name}: expected finite numbers, found {values[row].tolist()} in row {row + 1}")
+                found = f"{values[row].tolist()} in {place_of(row, self.lines)}"
+                raise InputError(f"{self.name}: expected finite numbers, found {found}")
 
     def at(self, times: Array) -> Array:
         """[M, C] values at `times` [M]. Raises InputError for a time that is before the first or after the last."""
@@ -83,17 +86,17 @@ class Attitude:
     name: str  #: whose it is, for messages
     times: Array  #: [N] seconds
     quaternions: Array  #: [N, 4] (w, x, y, z), to the world's axes
+    lines: Sequence[int] = ()  #: as a `Track`'s
 
     def __post_init__(self) -> None:
-        check_times(self.times, self.name)
+        check_times(self)
         with np.errstate(over="ignore"):
             lengths = np.linalg.norm(self.quaternions, axis=1)
         wrong = ~(np.abs(lengths - 1) <= UNIT)
         if wrong.any():
             row = int(wrong.argmax())
-            raise InputError(
-                f"{self.name}: expected quaternions of length 1, found one of {lengths[row]:.6g} in row {row + 1}"
-            )
+            found = f"one of {lengths[row]:.6g} in {place_of(row, self.lines)}"
+            raise InputError(f"{self.name}: expected quaternions of length 1, found {found}")
 
     def at(self, times: Array) -> Array:
         """[M, 3, 3] rotations at `times` [M]. Raises InputError for a time before the first or after the last."""
@@ -114,18 +117,26 @@ def _warn_of_guesses(track: Track | Attitude, times: Array, largest: float) -> N
         _log.warning("%s: turns by %.0f degrees between two rows; which way is a guess", track.name, largest)
 
 
-def check_times(times: Array, name: str) -> None:
-    """Raise InputError unless `times` [N] are finite and grow."""
+def place_of(row: int, lines: Sequence[int]) -> str:
+    """What errors call a row, counted from 0: its line, where `lines` [N] are known, else its number from 1."""
+    return f"line {lines[row]}" if lines else f"row {row + 1}"
+
+
+def check_times(track: Track | Attitude) -> None:
+    """Raise InputError unless its times are finite and grow."""
+    times, name, lines = track.times, track.name, track.lines
     if not len(times):
         raise InputError(f"{name}: expected at least one time, found none")
     bad = ~np.isfinite(times)
     if bad.any():
-        raise InputError(f"{name}: expected finite times, found {times[int(bad.argmax())]} in row {bad.argmax() + 1}")
+        row = int(bad.argmax())
+        raise InputError(f"{name}: expected finite times, found {times[row]} in {place_of(row, lines)}")
     steps = np.diff(times)
     if (steps <= 0).any():
         row = int((steps <= 0).argmax()) + 1
         how = "repeats that of" if steps[row - 1] == 0 else "is before"
-        raise InputError(f"{name}: expected times that grow, found in row {row + 1} one that {how} row {row}")
+        here, before = place_of(row, lines), place_of(row - 1, lines)
+        raise InputError(f"{name}: expected times that grow, found in {here} one that {how} {before}")
 
 
 def check_covered(track: Track | Attitude, times: Array) -> None:

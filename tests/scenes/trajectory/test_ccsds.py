@@ -163,6 +163,16 @@ def test_a_message_that_was_cut_off_is_warned_of(tmp_path, caplog):
     assert line.endswith("cut.oem: its data end 120.000 s before its STOP_TIME, 2030-03-01T12:10:00; is it whole?")
 
 
+def test_errors_name_the_line_of_a_later_segment(tmp_path):
+    one, two = aem(tmp_path / "1", range(0, 121, 60)), aem(tmp_path / "2", range(120, 301, 60))
+    text = one.read_text() + two.read_text().partition("\n\n")[2]
+    wrong = text.replace(f"{epoch(240)} ", f"{epoch(240)} 9")
+    (tmp_path / "a.aem").write_text(wrong)
+    line = next(k for k, line in enumerate(wrong.splitlines(), start=1) if line.startswith(epoch(240)))
+    with pytest.raises(InputError, match=f"a.aem: expected quaternions of length 1, found one of .* in line {line}$"):
+        motion_of({"camera": [tmp_path / "a.aem"]}, with_sun=False)
+
+
 def test_segments_that_meet(tmp_path):
     one, two = oem(tmp_path / "1", range(0, 121, 60)), oem(tmp_path / "2", range(120, 301, 60))
     both = tmp_path / "both.oem"
@@ -345,7 +355,7 @@ def test_messages_that_do_not_fit(tmp_path):
 def test_a_message_of_a_place_that_nothing_has(tmp_path):
     path = oem(tmp_path / "a.oem", TIMES)
     path.write_text(path.read_text().replace(" 0.0 ", " 1e300 ", 1))
-    with pytest.raises(InputError, match=r"a.oem: expected up to 1e\+15 m along an axis, found .*1e\+303.* in row 1"):
+    with pytest.raises(InputError, match=r"a.oem: expected up to 1e\+15 m along an axis, found .*1e\+303.* in line 16"):
         motion_of({"camera": [path]})
 
 
@@ -379,13 +389,13 @@ LINE = "2030-03-01T12:00:00 0 0 0 1"
             "ATTITUDE_TYPE: expected one of QUATERNION, .* found EULER_ANGLE",
         ),
         (kvn("AEM", {**AEM, "ATTITUDE_DIR": "C2D"}, LINE), "ATTITUDE_DIR: expected A2B or B2A, found C2D"),
-        (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers, found '2030-03-01T12:00:00 0 0 0'"),
-        (kvn("AEM", AEM, LINE.replace(" 1", " x")), "expected numbers in every line of data"),
-        (kvn("AEM", AEM, LINE.replace("12:", "24:")), "epoch: expected an epoch such as .* in row 1"),
-        (kvn("AEM", AEM, LINE.replace(" 1", " 2")), "expected quaternions of length 1, found one of 2 in row 1"),
-        (kvn("AEM", AEM, f"{LINE}\n{LINE}"), "expected times that grow, found in row 2 one that repeats that of row 1"),
-        (kvn("AEM", AEM, f"{LINE}\n{LINE.replace('12:', '11:')}"), "found in row 2 one that is before row 1"),
-        (kvn("AEM", AEM, LINE.replace(" 1", " nan")), "expected quaternions of length 1, found one of nan"),
+        (kvn("AEM", AEM, LINE[:-1]), "expected an epoch and 4 numbers, found '2030-03-01T12:00:00 0 0 0' in line 15"),
+        (kvn("AEM", AEM, LINE.replace(" 1", " x")), "expected numbers in line 15, found another word .*'x'"),
+        (kvn("AEM", AEM, LINE.replace("12:", "24:")), "epoch: expected an epoch such as .* in line 15"),
+        (kvn("AEM", AEM, LINE.replace(" 1", " 2")), "expected quaternions of length 1, found one of 2 in line 15"),
+        (kvn("AEM", AEM, f"{LINE}\n\n{LINE}"), "times that grow, found in line 17 one that repeats that of line 15"),
+        (kvn("AEM", AEM, f"{LINE}\n{LINE.replace('12:', '11:')}"), "found in line 16 one that is before line 15"),
+        (kvn("AEM", AEM, LINE.replace(" 1", " nan")), "expected quaternions of length 1, found one of nan in line 15"),
     ],
 )
 def test_files_that_are_no_message_are_refused(tmp_path, text, message):
