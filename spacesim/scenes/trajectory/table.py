@@ -20,6 +20,7 @@ import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -137,14 +138,13 @@ def _check_names(path: Path, columns: Columns, groups: Mapping[tuple[str, ...], 
         if _OURS.match(name) or "_from_world" in name:
             raise InputError(f"{name}: expected a column that is known, found this{did_you_mean(name, names)}")
         others.append(name)
-    if others:
-        _log.info("%s: columns that mean nothing here: %s", path, ", ".join(others)[:200])
     first_column: dict[str, str] = {}
     for group, what in groups.items():
         present = [name for name in group if name in columns]
         if present and len(present) < len(group):
             missing = next(name for name in group if name not in columns)
-            raise InputError(f"{missing}: expected a column beside {present[0]}, found none")
+            found = get_close_matches(missing, others, 1) or ["none"]
+            raise InputError(f"{missing}: expected a column beside {present[0]}, found {found[0]}")
         meaning = f"attitude of the {what.replace('world', '').replace('_from_', '')}" if "_from_" in what else what
         if present and meaning in first_column:
             raise InputError(f"{present[0]}: expected one way to say the {meaning}, found {first_column[meaning]} too")
@@ -153,6 +153,8 @@ def _check_names(path: Path, columns: Columns, groups: Mapping[tuple[str, ...], 
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
         raise InputError(f"{path}: expected columns of one length, found {min(lengths)} and {max(lengths)}")
+    if others:
+        _log.info("%s: columns that mean nothing here: %s", path, ", ".join(others)[:200])
 
 
 def _vectors(columns: Columns, names: Sequence[str]) -> Array:
@@ -202,6 +204,8 @@ def _csv(path: Path, content: bytes) -> Columns:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected CSV in UTF-8, found something else ({error})") from None
     header = [name.strip() for name in rows[0]] if rows else []
+    if len(header) == 1 and (other := next((mark for mark in ";\t" if mark in header[0]), None)):
+        raise InputError(f"{path}: expected commas between columns, found {other!r}")
     twice = next((name for name in header if header.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"{path}: expected each column once, found {twice!r} twice")

@@ -138,6 +138,8 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name, columns, message)
         ("a.txt", b"", "expected a table, .csv, .json, .parquet, found .txt"),
         ("a.csv", b"", "expected a header and at least one row, found nothing"),
         ("a.csv", b"time_s,camera_x_m\n1\n", "expected 2 values in row 1, found 1"),
+        ("a.csv", b"time_s;camera_x_m\n1;2,5\n", "a.csv: expected commas between columns, found ';'$"),
+        ("a.csv", b"time_s\tcamera_x_m\n1\t2\n", "a.csv: expected commas between columns, found '.t'$"),
         ("a.csv", b"time_s,time_s\n1,2\n", "expected each column once, found 'time_s' twice"),
         ("a.csv", b'time_s\n"1\n', "expected CSV in UTF-8, found something else"),
         ("a.csv", b"\xff\xfe", "expected CSV in UTF-8, found something else"),
@@ -160,6 +162,18 @@ def test_files_that_are_no_tables(tmp_path, name, content, message):
         read_table(path)
     with pytest.raises(InputError, match="expected a trajectory, found none"):
         read_table(tmp_path / "none.csv")
+
+
+def test_a_misspelled_column_is_reported_once(tmp_path, caplog):
+    caplog.set_level("INFO")
+    (tmp_path / "a.csv").write_text("time_s,sunx,sun_y,sun_z\n0,1,0,0\n")
+    with pytest.raises(InputError, match=r"sun_x: expected a column beside sun_y, found sunx$"):
+        read_table(tmp_path / "a.csv")
+    assert caplog.records == []
+    (tmp_path / "a.csv").write_text("time_s,sun_x,sun_y,sun_z,note\n0,1,0,0,9\n")
+    read_table(tmp_path / "a.csv")
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [f"{tmp_path / 'a.csv'}: columns that mean nothing here: note"]
 
 
 def test_parquet_without_pyarrow(tmp_path, monkeypatch):
