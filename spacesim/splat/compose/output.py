@@ -80,10 +80,26 @@ def compose(
         source = scene.composition.path or "scene"
         raise InputError(f"{source}: expected the Sun's direction for a scene that it changes, found none; add [sun]")
     frame.composition.stops(exposure)
+    _warn_of_a_cut(scene)
     with lock_folder(out):
         _make(out)
         remove_leftovers(out)
         return _render_frames(scene, out, report, exposure)
+
+
+def _warn_of_a_cut(scene: PosedScene) -> None:
+    """Where the film, of which each picture is shown for 1 / fps seconds, ends before the last keyframe."""
+    last = scene.keyframes[-1].time if scene.keyframes else 0.0
+    if scene.frames + 0.5 < last * scene.fps:
+        log.warning(
+            "%s: %d frames at %g a second end at %.4g s, before the last keyframe at %.4g s; without `frames` it is "
+            "reached",
+            scene.composition.path or "scene",
+            scene.frames,
+            scene.fps,
+            scene.frames / scene.fps,
+            last,
+        )
 
 
 def _render_frames(

@@ -147,6 +147,17 @@ def test_the_video_has_the_scenes_pictures_a_second(tmp_path):
         assert [frame.pts * frame.time_base for frame in file.decode(video=0)][3] == Fraction(3 * 1001, 24000)
 
 
+def test_frames_that_end_before_the_last_keyframe_are_warned_of(tmp_path, caplog):
+    whole = scene(3, methods=("vanilla",))  # its last keyframe is where the last picture ends
+    compose(whole, tmp_path / "out")
+    assert caplog.records == []
+    compose(replace(whole, frames=2), tmp_path / "out")
+    assert [record.getMessage() for record in caplog.records] == [
+        "scene: 2 frames at 24 a second end at 0.08333 s, before the last keyframe at 0.125 s; without `frames` it is "
+        "reached"
+    ]
+
+
 def test_without_an_encoder_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "encoder", lambda: None)
     done = compose(scene(), tmp_path / "out")
