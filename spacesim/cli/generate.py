@@ -106,8 +106,9 @@ def run(options: argparse.Namespace) -> None:
         if options.frames is not None:
             part = generate_part(scene, options.out, options.frames, report, options.workers, options.ray)
             made, count, complete = part
-            then = "the dataset is complete" if complete else "--resume completes it"
-            interrupts.print_output(f"{options.out}: {made} of {count} frames; {then}")
+            first = options.frames[0]
+            then = "the dataset is complete" if complete else "--resume completes the dataset"
+            interrupts.print_output(f"{options.out}: frames {first}:{first + made} of all {count} are made; {then}")
             return
         dataset = generate(scene, options.out, options.resume, report, options.workers, options.ray)
     interrupts.print_output(

@@ -303,13 +303,13 @@ class _DatasetPlan:
         if not kept["train"]:
             expected = f"a training frame of whose object at least {least:g} is sunlit"
             raise InputError(f"min_sunlit: expected {expected}, found none of {len(self.train)}")
-        count = len(self.specs)
-        _log.info(
-            "generate: %d of %d frames are left out, as less than %g of their object is sunlit or none is seen",
-            count - len(lit),
-            count,
-            least,
-        )
+        if left := len(self.specs) - len(lit):
+            _log.info(
+                "generate: %d of %d frames are left out, as less than %g of their object is sunlit or none is seen",
+                left,
+                len(self.specs),
+                least,
+            )
         self.train, self.test, self.keys = kept["train"], kept["test"], keys
 
     def _refuse_cameras_inside(self, config: SceneConfig) -> None:

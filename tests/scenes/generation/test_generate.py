@@ -278,12 +278,14 @@ def test_parts_make_the_same_dataset_as_one_run(made, tmp_path, spacesim):
     with pytest.raises(InputError, match=r"frames: expected .* found '3:3'"):
         generate_part(boxsat(), root, (3, 3))
     small = ("generate", "boxsat", "--views", 4, "--test-views", 2, "--resolution", 16, "--spp", 1, "--out")
-    for part in ("0:3", "3:100"):
+    for part, frames in (("0:3", "0:3"), ("3:100", "3:6")):
         done = spacesim(*small, tmp_path / "b", "--frames", part)
-        assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; --resume completes it\n")
+        expected = f"frames {frames} of all 6 are made; --resume completes the dataset"
+        assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: {expected}\n")
     assert spacesim(*small, tmp_path / "b", "--resume").code == 0
     done = spacesim(*small, tmp_path / "b", "--frames", "0:3")
-    assert (done.code, done.output) == (0, f"{tmp_path / 'b'}: 3 of 6 frames; the dataset is complete\n")
+    assert done.output == f"{tmp_path / 'b'}: frames 0:3 of all 6 are made; the dataset is complete\n"
+    assert done.code == 0
     assert spacesim(*small, tmp_path / "c").code == 0
     assert contents(tmp_path / "b") == contents(tmp_path / "c")
     assert spacesim(*small, tmp_path / "d", "--frames", "1-2").is_refusal("--frames", "A:B")
@@ -384,6 +386,10 @@ def test_frames_with_less_in_sunlight_are_left_out(lit_and_dark, tmp_path, caplo
     dark = np.flatnonzero(~np.array(is_kept))
     assert scene["left_out"] == {"train": [k for k in dark if k < 16], "test": [k - 16 for k in dark if k >= 16]}
     assert "left_out" not in json.loads((root / "scene.json").read_text())
+    caplog.clear()
+    generate(replace(limited, rig=replace(config.rig, max_phase_deg=20.0, views=2, test_views=0)), tmp_path / "lit")
+    assert json.loads((tmp_path / "lit/scene.json").read_text())["left_out"] == {"train": [], "test": []}
+    assert not any("left out" in record.getMessage() for record in caplog.records)
 
 
 def test_parts_resume_and_workers_leave_out_the_same_frames(lit_and_dark, tmp_path):
