@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cache
 
 from spacesim.data.errors import InputError
+from spacesim.data.structure import did_you_mean
 from spacesim.scenes.spacecraft.boxsat import boxsat
 from spacesim.scenes.spacecraft.cubesat import cubesat
 from spacesim.scenes.spacecraft.part import Spacecraft
@@ -25,7 +26,8 @@ def spacecraft(name: str) -> Spacecraft:
     """The built-in spacecraft called `name`, made once (a quarter of a second): its meshes are not to be changed.
     InputError lists the names where there is none."""
     if not isinstance(name, str) or name not in _BUILT_IN:
-        raise InputError(f"spacecraft: expected one of {', '.join(SPACECRAFT)}, found {name!r}")
+        hint = did_you_mean(name, SPACECRAFT)
+        raise InputError(f"spacecraft: expected one of {', '.join(SPACECRAFT)}, found {name!r}{hint}")
     return _make(name)
 
 
