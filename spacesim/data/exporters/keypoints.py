@@ -6,6 +6,7 @@
 Metres, in the object's body frame; symmetries as BOP's models_info.json has them, but for the unit.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,6 +35,9 @@ MIDST = 0.1  #: weight of what has the surface all around, to be added to that d
 NEAR = 0.08  #: of the object's size: around a candidate
 SAMPLES = 10_000  #: points of the surface
 START = 1e-5  #: of the object's size: how far from the surface rays begin
+REACH = 3.0  #: of the object's size: a keypoint farther outside is in another unit, most likely
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,9 @@ def body_labels(
         entry = entries.get(target.id)
         if entry is not None and not of_model.setdefault(number, entry).is_like(entry):
             raise InputError(f"{path}: expected the same of objects of one shape, found others of object {target.id}")
+    for target in targets:
+        if target.id in entries:
+            _warn_of_far_keypoints(path, entries[target.id], target)
     for number, target in zip(numbers, targets, strict=True):
         if number not in of_model:
             keypoints = find_keypoints(target.vertices, target.faces, count)
@@ -104,6 +111,16 @@ def body_labels(
         replace(of_model[number], id=target.id, name=target.name)
         for number, target in zip(numbers, targets, strict=True)
     ]
+
+
+def _warn_of_far_keypoints(path: Path, entry: BodyLabels, target: LabelledObject) -> None:
+    used = target.vertices[np.unique(target.faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    size, outside = float((high - low).max()), np.maximum(low - entry.points, entry.points - high).max(axis=1)
+    if outside.max() > REACH * size:
+        name, away = list(entry.keypoints)[int(outside.argmax())], f"{outside.max():.4g} m"
+        whose = f"object {target.id}, which is {size:.3g} m large"
+        _log.warning("%s: keypoint %s is %s outside %s; keypoints are in metres", path, name, away, whose)
 
 
 def write_body_labels(path: Path, bodies: Sequence[BodyLabels]) -> None:

@@ -136,6 +136,20 @@ def test_files_that_cannot_be_are_refused_in_a_sentence(labelled, tmp_path, obje
         body_labels(labelled, labelled_objects(labelled), path)
 
 
+def test_keypoints_in_another_unit_are_warned_of(labelled, tmp_path, caplog):
+    """In millimetres, say. A place beside the body is none."""
+    path, targets = tmp_path / "given.json", labelled_objects(labelled)
+    beside = {"id": 1, "keypoints": {"tip": [0, 0, 1], "beside": [0, 0, 4.0]}}
+    path.write_text(json.dumps({"objects": [beside]}))
+    body_labels(labelled, targets, path)
+    assert caplog.messages == []
+    path.write_text(json.dumps({"objects": [{"id": 1, "keypoints": {"tip": [0, 0, 1], "far": [0, -1000, 500]}}]}))
+    assert body_labels(labelled, targets, path)[0].points[1].tolist() == [0, -1000, 500]
+    (warning,) = caplog.messages
+    assert warning.startswith(f"{path}: keypoint far is 99")
+    assert warning.endswith(" m large; keypoints are in metres")
+
+
 def test_impossible_meshes_and_counts():
     box = trimesh.creation.box()
     for count in (0, 1001):
