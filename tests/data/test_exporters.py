@@ -21,7 +21,7 @@ from spacesim.data.exporters import (
     write_webdataset,
     write_yolo,
 )
-from spacesim.data.exporters.objects import opaque_picture
+from spacesim.data.exporters.objects import opaque_picture, select_object
 from spacesim.data.exporters.speedplus import _label
 from spacesim.data.files import read_json, write_json
 from spacesim.data.images import read_exr, read_png
@@ -98,6 +98,17 @@ def test_speedplus_poses_project_the_mesh_onto_the_object(data, tmp_path):
             assert (seen.max(axis=0) <= pixels.max(axis=0) + 0.6).all()
     assert camera["fx"] / camera["ppx"] == pytest.approx(camera["cameraMatrix"][0][0])
     assert camera["distCoeffs"] == [0] * 5
+
+
+def test_objects_of_one_name_are_told_apart_by_their_numbers(data, tmp_path):
+    shutil.copytree(data, tmp_path / "data")
+    scene = read_json(data / "scene.json")
+    scene["objects"][2]["name"] = "boxsat"
+    write_json(tmp_path / "data/scene.json", scene)
+    targets = labelled_objects(read_dataset(tmp_path / "data"))
+    with pytest.raises(InputError, match="object: expected one of the numbers 1, 3, found 'boxsat', the name of each"):
+        select_object(targets, "boxsat")
+    assert [select_object(targets, name).id for name in (None, "3", "cubesat")] == [1, 3, 2]
 
 
 def test_speedplus_pose_by_hand():
@@ -274,6 +285,9 @@ def test_what_cannot_be_exported_is_refused_in_a_sentence(data, tmp_path):
     write_json(tmp_path / "old/scene.json", scene)
     with pytest.raises(InputError, match=r"scene\.json: expected objects, their poses"):
         labelled_objects(read_dataset(tmp_path / "old"))
+    (tmp_path / "old/scene.json").unlink()
+    with pytest.raises(InputError, match=r"old: expected data that `spacesim generate` made, .* found no scene\.json"):
+        write_coco(read_dataset(tmp_path / "old"), tmp_path / "d")
     scene = read_json(data / "scene.json")
     del scene["exposure"]
     write_json(tmp_path / "old/scene.json", scene)

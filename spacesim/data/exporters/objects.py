@@ -40,8 +40,12 @@ class LabelledObject:
 
 
 def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
-    """The objects of a dataset. Raises InputError where scene.json or mesh.ply do not distinguish them."""
+    """The objects of a dataset. Raises InputError where it was not generated, and where scene.json or mesh.ply do not
+    distinguish them."""
     path = dataset.root / "scene.json"
+    if not dataset.scene:
+        expected = "expected data that `spacesim generate` made, as no other has labels of objects"
+        raise InputError(f"{dataset.root}: {expected}, found no scene.json")
     try:
         objects, counts = dataset.scene["objects"], dataset.scene["mesh"]
         sizes = [(int(count["vertices"]), int(count["faces"])) for count in counts]
@@ -93,10 +97,16 @@ def _is_similarity(pose: Array) -> bool:
 
 
 def select_object(targets: list[LabelledObject], name: str | None) -> LabelledObject:
-    """The target of that number or name; without one the first. Raises InputError where there is none."""
-    for target in targets:
-        if name is None or name in (str(target.id), target.name):
-            return target
+    """The target of that number or name; without one the first. Raises InputError where there is none, and for a name
+    that several have."""
+    if name is None:
+        return targets[0]
+    found = [target for target in targets if str(target.id) == name] or [t for t in targets if t.name == name]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        numbers = ", ".join(str(target.id) for target in found)
+        raise InputError(f"object: expected one of the numbers {numbers}, found {name!r}, the name of each")
     names = ", ".join(f"{target.id} {target.name}" for target in targets)
     raise InputError(f"object: expected one of {names}, found {name!r}")
 
