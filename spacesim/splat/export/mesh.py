@@ -3,6 +3,7 @@
 Only what a view has seen is surface: where voxels were never in sight, the mesh has a hole, not a wall.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -31,8 +32,10 @@ MAX_PIXELS = 512  #: of a picture's longer side; larger ones are rendered smalle
 MAX_TRUNCATION = 100  #: voxels: the grid has as many around the object
 OUTLIERS = 1e-3  #: share of the points seen, at each end of each axis, that does not decide how large the object is
 MARGIN = 0.1  #: of the size so found, around it, in which outliers still count
+COARSE = 0.1  #: of the size: voxels that are larger leave no shape
 PIECE = 1e-3  #: of the largest piece's area: smaller ones are dropped
 _CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,10 @@ def mesh_of_depths(
     if box is None:
         report(steps)
         return RunMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), config.voxel or 0.0, len(views))
-    voxel = config.voxel or float(np.linalg.norm(box[1] - box[0])) / config.voxels
+    size = float(np.linalg.norm(box[1] - box[0]))
+    voxel = config.voxel or size / config.voxels
+    if voxel > COARSE * size:
+        _log.warning("voxel: %.3g m is too coarse for an object of %.3g m; take less than a tenth of it", voxel, size)
     grid = Grid.around(*box, voxel, (config.truncation + 1) * voxel)
     check_memory(grid)
     field = fuse(views, grid, config.truncation, progress=lambda done: report(len(views) + done))

@@ -13,7 +13,16 @@ from spacesim.data.records import Camera
 from spacesim.data.store import load_truth, read_dataset
 from spacesim.splat.export import fusion
 from spacesim.splat.export.fusion import DepthView, DistanceField, Grid, fuse
-from spacesim.splat.export.mesh import MeshConfig, bounds, cameras_around, depth_of, mesh_of, select_views, surface
+from spacesim.splat.export.mesh import (
+    MeshConfig,
+    bounds,
+    cameras_around,
+    depth_of,
+    mesh_of,
+    mesh_of_depths,
+    select_views,
+    surface,
+)
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.train.start import gaussians_at
 
@@ -193,6 +202,17 @@ def test_a_ball_of_gaussians():
     again = mesh_of(ball(), cameras(30), MeshConfig(voxels=48))
     assert np.array_equal(found.vertices, again.vertices)
     assert np.array_equal(found.faces, again.faces)
+
+
+def test_voxels_too_coarse_for_the_shape_are_warned_of(caplog):
+    views = [sphere_view(camera) for camera in cameras(8)]
+    shown = {view.camera.world_from_camera.tobytes(): view.depth for view in views}
+    size = float(np.linalg.norm(np.subtract(*bounds(views)[::-1])))
+    for share, warned in ((0.09, False), (0.11, True)):
+        caplog.clear()
+        config = MeshConfig(voxel=share * size)
+        mesh_of_depths(lambda camera: shown[camera.world_from_camera.tobytes()], cameras(8), config)
+        assert any("is too coarse for an object of" in message for message in caplog.messages) == warned
 
 
 def test_floaters_far_away_do_not_make_the_grid_large():
