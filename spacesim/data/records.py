@@ -60,7 +60,8 @@ class Camera:
     def __post_init__(self) -> None:
         pose = as_numbers(self.world_from_camera)
         if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-            raise InputError(f"world_from_camera: expected a finite [4, 4] matrix, found shape {pose.shape}")
+            found = "NaN or infinity" if pose.shape == (4, 4) else f"shape {pose.shape}"
+            raise InputError(f"world_from_camera: expected a [4, 4] matrix of finite numbers, found {found}")
         rotation = as_rotation(pose[:3, :3])
         if rotation is None:
             raise InputError("world_from_camera: expected a rotation in its upper left [3, 3], found none")

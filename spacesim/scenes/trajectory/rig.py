@@ -241,8 +241,11 @@ class PoseRig(Rig):
         if not len(self._poses("world_from_camera", self.world_from_camera)):
             raise InputError("world_from_camera: expected at least one pose, found none")
         for name in ("world_from_camera", "test"):
-            for pose in self._poses(name, getattr(self, name)):
-                CameraConfig().at(pose)
+            for k, pose in enumerate(self._poses(name, getattr(self, name))):
+                try:
+                    CameraConfig().at(pose)
+                except InputError as error:
+                    raise InputError(f"{name}[{k}]: {str(error).partition(': ')[2]}") from None
         self._suns(False)
         self._suns(True)
         check_exposures(self._numbers("exposure", self.exposure))

@@ -109,6 +109,10 @@ def test_a_class_whose_fields_json_does_not_have(tmp_path):
         ss.generate("boxsat", tmp_path / "data", rig=WithArray(extra=np.eye(2)), **SMALL)
 
 
+NO_POSE = POSES.copy()
+NO_POSE[2, 0, 3] = np.nan
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -118,6 +122,11 @@ def test_a_class_whose_fields_json_does_not_have(tmp_path):
         ),
         ({"world_from_camera": []}, "world_from_camera: expected at least one pose, found none"),
         ({"world_from_camera": "x"}, "world_from_camera: expected an array of numbers, found 'x'"),
+        (
+            {"world_from_camera": NO_POSE},
+            r"world_from_camera\[2\]: expected a .* of finite numbers, found NaN or infinity",
+        ),
+        ({"test": NO_POSE[2]}, r"test\[0\]: expected a \[4, 4\] matrix of finite numbers, found NaN or infinity"),
         ({"sun": [(1, 2), (3, 4)]}, r"sun: expected one Sun, or 4, one for each pose, found \[2, 2\]"),
         ({"sun": (1, 95)}, "sun: expected .azimuth, elevation up to 90"),
         ({"sun": (0, 0, 0)}, "sun direction: expected 3 finite numbers"),
@@ -149,7 +158,7 @@ def test_what_is_no_rig(tmp_path):
         ss.generate("boxsat", tmp_path / "data", rig=Corkscrew(), trajectory="a.csv", **SMALL)
     skewed = POSES.copy()
     skewed[1, 0, 0] = 3
-    with pytest.raises(InputError, match="world_from_camera: expected a rotation"):
+    with pytest.raises(InputError, match=r"world_from_camera\[1\]: expected a rotation"):
         ss.generate("boxsat", tmp_path / "data", rig=ss.PoseRig(skewed), **SMALL)
 
 
