@@ -400,6 +400,18 @@ def test_render_a_camera_file(spacesim, tiny_run, tiny_data, tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+def test_a_view_that_was_not_chosen_is_named(spacesim, tiny_run, tiny_data, tmp_path, caplog):
+    common = ("render", tiny_run, "--out", tmp_path / "a.png")
+    first = read_dataset(tiny_data).frames[0].file_path
+    assert spacesim(*common).errors == [f"seen from frame 0, {first}; --frame K or --camera FILE takes another view"]
+    assert spacesim(*common, "--frame", 0).errors == []
+    whole = tiny_data / "transforms.json"
+    with caplog.at_level("INFO", "spacesim"):
+        assert spacesim(*common, "--camera", whole).code == 0
+    file_path = json.loads(whole.read_text())["frames"][0]["file_path"]
+    assert f"{whole}: the camera is its first frame's, {file_path}" in caplog.messages
+
+
 def test_a_frame_is_seen_under_the_sun_that_was_estimated(tiny_data, tmp_path):
     meta = json.loads((tiny_data / "transforms.json").read_text())
     for entry in meta["frames"]:

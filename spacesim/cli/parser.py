@@ -132,19 +132,21 @@ def add_view(parser: Parser) -> None:
     parser.add_argument("--data", type=Path, metavar="DATA", help="the dataset, where it has moved since training")
 
 
-def view_of(options: argparse.Namespace, run: "Run | NerfRun") -> "tuple[Camera, Sun | None]":
-    """The camera that the options of `add_view` name, and the Sun of a frame, which the run may have estimated."""
+def view_of(options: argparse.Namespace, run: "Run | NerfRun") -> "tuple[Camera, Sun | None, str]":
+    """The camera that the options of `add_view` name, the Sun of a frame, which the run may have estimated, and which
+    frame it is, to be said where none was chosen, else ""."""
     from spacesim.data.transforms import read_camera, read_dataset, read_sun
 
     if options.camera:
-        return read_camera(options.camera), None
+        return read_camera(options.camera), None, ""
     frames = read_dataset(options.data or _data_of(run.config)).frames
     index = options.frame or 0
     if not 0 <= index < len(frames):
         raise InputError(f"frame: expected 0 to {len(frames) - 1}, found {index}")
     frame, cameras = frames[index], run.path / "cameras.json"
     estimated = read_sun(cameras, frame.file_path) if frame.sun is None and cameras.is_file() else None
-    return frame.camera, frame.sun or estimated
+    note = f"seen from frame 0, {frame.file_path}; --frame K or --camera FILE takes another view"
+    return frame.camera, frame.sun or estimated, note if options.frame is None else ""
 
 
 def _data_of(config: JsonDict) -> Path:

@@ -1,6 +1,7 @@
 """What several commands print."""
 
 import re
+import sys
 from functools import partial
 
 from spacesim import interrupts
@@ -12,6 +13,12 @@ WANTS_FILTER = "the run is antialiased: viewers without Mip-Splatting's 2D filte
 RELATIVE = "the data that says how bright the Sun was is not there: albedo is relative, to a Sun at 1 au and 0 EV"
 
 _IN_SOME_FRAMES = re.compile(r" is null in \d+ of \d+ frames")
+
+
+def print_note(note: str | None) -> None:
+    """A line of standard error, where there is something to note."""
+    if note:
+        print(note, file=sys.stderr)
 
 
 def print_headline(metrics: JsonDict) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, angles_or_none, view_of
-from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE
+from spacesim.cli.printing import KNOWS_ONE_LIGHT, RELATIVE, print_note
 from spacesim.data.errors import InputError
 from spacesim.data.integrity.outputs import check_output
 from spacesim.learning.prediction import KINDS, MATERIAL_KINDS
@@ -38,13 +38,14 @@ def run(options: argparse.Namespace) -> None:
     lit = run.gaussian_run
     if options.sun and not run.relightable:
         print(KNOWS_ONE_LIGHT, file=sys.stderr)
-    camera, of_frame = view_of(options, run)
+    camera, of_frame, note = view_of(options, run)
     if options.kind in MATERIAL_KINDS:
         if options.exposure is not None:
             raise InputError(f"--exposure: expected none with --kind {options.kind}, which no light changes")
         write_material(run.draw_material(camera), options.kind, options.out)
         if lit and lit.albedo_is_relative:
             print(RELATIVE, file=sys.stderr)
+        print_note(note)
         interrupts.print_output(options.out)
         return
     sun, light = named_sources(run, options.sun, options.earth, of_frame)
@@ -53,4 +54,5 @@ def run(options: argparse.Namespace) -> None:
     surface = seen.depth[seen.depth > 0]
     if options.kind == "depth" and options.out.suffix.lower() == ".png" and surface.size:
         print(f"depth: {surface.min():.4g} m is white, {surface.max():.4g} m darkest; .exr has metres", file=sys.stderr)
+    print_note(note)
     interrupts.print_output(options.out)

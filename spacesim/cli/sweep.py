@@ -1,13 +1,13 @@
 """`spacesim sweep`."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from spacesim import interrupts
 from spacesim.cli.parser import Parser, add_view, resolution, view_of
+from spacesim.cli.printing import print_note
 
 SUMMARY, NEEDS_BACKEND = "the Sun goes round a run: a contact sheet and a video", True
 
@@ -18,7 +18,7 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     add_view(parser)
     path = parser.add_mutually_exclusive_group()
     path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
-    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun rises at this azimuth and goes overhead")
+    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun goes over the zenith from the horizon here")
     parser.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
     parser.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
     parser.add_argument("--exposure", type=float, metavar="EV", help="of a run in linear light (that of its pictures)")
@@ -34,13 +34,13 @@ def run(options: argparse.Namespace) -> None:
 
     suns = suns_around(FRAMES if options.frames is None else options.frames, options.elevation, options.azimuth)
     run = load_run(options.path)
-    camera, of_frame = view_of(options, run)
+    camera, of_frame, note = view_of(options, run)
     if of_frame is not None:
         suns = [replace(sun, earth=of_frame.earth) for sun in suns]
     if options.size is not None:
         camera = resize_camera(camera, options.size)
     with show_progress("sweep", "frames") as report:
         done = sweep(run, camera, suns, options.out, options.kind, options.keep_frames, report, options.exposure)
-    if done.note is not None:
-        print(done.note, file=sys.stderr)
+    print_note(note)
+    print_note(done.note)
     interrupts.print_output(" ".join(str(path) for path in (done.sheet, done.video) if path is not None))

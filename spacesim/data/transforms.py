@@ -125,13 +125,14 @@ def read_depth_unit(path: Path, values: Json) -> float:
 def read_camera(path: Path) -> Camera:
     """The camera of a JSON file with the keys of a frame: transform_matrix, w, h, fl_x or camera_angle_x, ...
 
-    A whole transforms.json is taken too: its first frame counts. Raises InputError where a key is missing or
-    broken.
+    A whole transforms.json is taken too: its first frame counts, as the log says. Raises InputError where a key is
+    missing or broken.
     """
     values = dict(read_object(path))
     frames = values.pop("frames", None)
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         values |= frames[0]
+        _log.info("%s: the camera is its first frame's, %s", path, values.get("file_path"))
     values = _without_nulls(values)
     try:
         if "w" not in values or "h" not in values:
