@@ -37,7 +37,8 @@ CHUNK = 1 << 14  #: Gaussians that are fitted at once
 class FittedMaterial:
     """Of N Gaussians, float32; linear camera RGB."""
 
-    #: [N, 3] reflectance: a metal's at normal incidence, in [0, 1], else of the Lambertian surface (under its facets)
+    #: [N, 3] reflectance: a metal's at normal incidence, in [0, 1], else of the Lambertian surface (under its facets),
+    #: which is fitted without an upper bound
     albedo: np.ndarray
     metallic: np.ndarray  #: [N] 1 of metals, 0 of others
     roughness: np.ndarray  #: [N] alpha of GGX, 1 where no facets are seen
