@@ -19,7 +19,7 @@ from spacesim.splat.raster.lists.tiles import round_capacity
 
 MISSED = 0xFFFFFFFF  #: in place of a disc's number
 MOST_CELLS = 160  #: along the longest side
-CELL = 1.5  #: median radii of a disc
+CELL = 1.25  #: median radii of a disc
 MOST_ENTRIES = 1 << 25  #: of discs in cells; larger cells have fewer
 ROUNDING = 1e-3  #: of a cell
 FAR = 1e30  #: metres, no ray gets there
@@ -79,46 +79,47 @@ class DiscGrid:
         edges = [ad.Float(at[i] + dr.select(forward[i], ad.Int32(1), 0)) for i in range(3)]
         leaves = [(self.low[i] + self.cell * edges[i] - start[i]) * inverse[i] for i in range(3)]
         width = [self.cell * dr.abs(inverse[i]) for i in range(3)]
+        strides = [ad.Int32(1), ad.Int32(self.columns[0]), ad.Int32(self.columns[0] * self.columns[1])]
+        steps = [dr.select(forward[i], strides[i], -strides[i]) for i in range(3)]
+        left = [dr.select(forward[i], ad.Int32(self.columns[i]) - 1 - at[i], at[i]) for i in range(3)]  # cells ahead
+        cell = sum((at[i] * strides[i] for i in (1, 2)), at[0])
 
-        def entries(at: list[Any], active: Bool) -> tuple[UInt32, UInt32]:
-            cell = (ad.UInt32(at[2]) * self.columns[1] + ad.UInt32(at[1])) * self.columns[0] + ad.UInt32(at[0])
-            return dr.gather(ad.UInt32, self.starts, cell, active), dr.gather(ad.UInt32, self.starts, cell + 1, active)
+        def has_more(k: UInt32, end: UInt32, *_state: object) -> Bool:
+            return k < end
+
+        def test(k: UInt32, end: UInt32, nearest: Float, met: UInt32) -> tuple[UInt32, UInt32, Float, UInt32]:
+            disc = dr.gather(ad.UInt32, self.discs, k)
+            numbers = load(self.records, disc, self.count)
+            center, normal, first, second = (ad.Array3f(numbers[i : i + 3]) for i in (0, 3, 6, 9))
+            distance = dr.dot(center - start, normal) / dr.dot(direction, normal)
+            off = start + distance * direction - center
+            is_met = dr.square(dr.dot(off, first)) + dr.square(dr.dot(off, second)) < 1
+            is_met &= (distance > 0) & ((distance < nearest) | ((distance == nearest) & (disc < met)))
+            return k + 1, end, dr.select(is_met, distance, nearest), dr.select(is_met, disc, met)
 
         def goes_on(going: Bool, *_state: object) -> Bool:
             return going
 
         def step(
-            going: Bool, at: list[Any], leaves: list[Float], k: UInt32, end: UInt32, nearest: Float, met: UInt32
-        ) -> tuple[Bool, list[Any], list[Float], UInt32, UInt32, Float, UInt32]:
-            tests = going & (k < end)
-            disc = dr.gather(ad.UInt32, self.discs, k, tests)
-            numbers = load(self.records, disc, self.count, tests)
-            center, normal, first, second = (ad.Array3f(numbers[i : i + 3]) for i in (0, 3, 6, 9))
-            distance = dr.dot(center - start, normal) / dr.dot(direction, normal)
-            off = start + distance * direction - center
-            is_met = dr.square(dr.dot(off, first)) + dr.square(dr.dot(off, second)) < 1
-            is_nearer = (distance < nearest) | ((distance == nearest) & (disc < met))
-            is_met &= tests & (distance > 0) & is_nearer
-            nearest, met = dr.select(is_met, distance, nearest), dr.select(is_met, disc, met)
-
-            moves, leave = going & ~tests, dr.minimum(dr.minimum(leaves[0], leaves[1]), leaves[2])
-            going &= tests | (nearest > leave)
-            moves &= going
+            going: Bool, cell: Any, left: list[Any], leaves: list[Float], nearest: Float, met: UInt32
+        ) -> tuple[Bool, Any, list[Any], list[Float], Float, UInt32]:
+            k, end = (dr.gather(ad.UInt32, self.starts, ad.UInt32(cell + i), going) for i in (0, 1))
+            *_, nearest, met = dr.while_loop(
+                (k, end, nearest, met), has_more, test, mode="symbolic", label="discs of a cell"
+            )
+            leave = dr.minimum(dr.minimum(leaves[0], leaves[1]), leaves[2])
+            going &= nearest > leave
             along = [leaves[0] == leave, (leaves[1] == leave) & (leaves[0] != leave)]
             along.append(~(along[0] | along[1]))
-            at, leaves = list(at), list(leaves)
+            left, leaves = list(left), list(leaves)
             for i in range(3):
-                goes = moves & along[i]
-                at[i] += dr.select(goes, dr.select(forward[i], ad.Int32(1), -1), 0)
-                leaves[i] += dr.select(goes, width[i], 0)
-                going &= ~goes | ((at[i] >= 0) & (at[i] < ad.Int32(self.columns[i])))
-            moves &= going
-            start_of, end_of = entries(at, moves)
-            k, end = dr.select(moves, start_of, k + 1), dr.select(moves, end_of, end)
-            return going, at, leaves, k, end, nearest, met
+                left[i] -= dr.select(along[i], ad.Int32(1), 0)
+                leaves[i] += dr.select(along[i], width[i], 0)
+                cell += dr.select(along[i], steps[i], 0)
+                going &= left[i] >= 0
+            return going, cell, left, leaves, nearest, met
 
-        k, end = entries(at, inside)
-        state = (inside, at, leaves, k, end, ad.Float(FAR), ad.UInt32(MISSED))
+        state = (inside, cell, left, leaves, ad.Float(FAR), ad.UInt32(MISSED))
         return dr.while_loop(state, goes_on, step, mode="symbolic", label="first disc")[-1]
 
 

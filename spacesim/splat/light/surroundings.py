@@ -26,7 +26,7 @@ from spacesim.splat.raster.gaussians import Gaussians, opacities, principal_axes
 from spacesim.splat.raster.lists.tiles import round_capacity
 
 #: steps of training after which rays are traced anew: the first, then each so many, and from `EARLY` on each so many
-FIRST, OFTEN, EARLY, RARELY = 50, 100, 1000, 500
+FIRST, OFTEN, EARLY, RARELY = 50, 200, 1000, 500
 RECOVERY = 200  #: steps after an opacity reset until most opacities stop rays again
 MOST_RAYS = 512  #: from each Gaussian; docs/research/light.md
 LEAST_RAYS = 128  #: from each Gaussian
