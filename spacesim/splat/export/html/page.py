@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict, read_json, write_bytes
+from spacesim.data.files import JsonDict, write_bytes
 from spacesim.data.geometry import robust_radius
 from spacesim.data.integrity.outputs import check_output
 from spacesim.learning.folder import run_name
@@ -39,8 +39,7 @@ def write_page(
     name: str | None = None,
 ) -> None:
     """Write `run` as a page. report: called with (steps done, of all);  earth: that any Sun lights, for a run that
-    `knows_earth`, and that can hide it; where it is stays;  name: above the picture, by default the run's, of
-    a folder "run" that of its data's scene, if that is there
+    `knows_earth`, and that can hide it; where it is stays;  name: above the picture, by default the run's
 
     The same run on the same backend gives the same bytes. Raises InputError for a run without Gaussians and for a file
     that cannot be written.
@@ -49,14 +48,7 @@ def write_page(
         raise InputError(f"{run.path}: expected a run with Gaussians, found none")
     check_output(Path(path), "html")
     about, arrays = _content(run, report, earth if run.relightable else None)
-    write_bytes(Path(path), _page(run, name or _name(run), about, arrays).encode())
-
-
-def _name(run: Run) -> str:
-    path = Path(run.config["data"]["path"]) / "scene.json"
-    scene = read_json(path) if run.path.resolve().name == "run" and path.is_file() else {}
-    name = scene.get("scene") if isinstance(scene, dict) else None
-    return str(name or run_name(run.path))
+    write_bytes(Path(path), _page(run, name or run_name(run.path), about, arrays).encode())
 
 
 def _content(run: Run, report: Callable[[int, int], None] | None, earth: Earth | None) -> tuple[JsonDict, Arrays]:

@@ -137,17 +137,6 @@ def state(tab) -> SimpleNamespace:
     return SimpleNamespace(**tab.evaluate("controls.state"))
 
 
-def test_a_folder_named_run_has_the_name_of_its_scene(runs, tmp_path):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data/scene.json").write_text(json.dumps({"scene": "boxsat"}))
-    titles = []
-    for folder, data in (("mine/run", "data"), ("mine/run", "gone"), ("mine/other", "data")):
-        config = {"method": "vanilla", "data": {"path": str(tmp_path / data)}}
-        write_page(replace(runs["plain"], path=tmp_path / folder, config=config), tmp_path / "page.html")
-        titles += re.findall("<title>(.+) ·", (tmp_path / "page.html").read_text(encoding="utf-8"))
-    assert titles == ["boxsat", "mine", "other"]
-
-
 @pytest.mark.parametrize("name", CLOSE)
 def test_pictures_are_those_of_render(name, runs, tabs):
     near_and_far = [[3.0, 0.5, 1.0], [-2.0, 2.0, -1.5], [0.2, -0.1, 4.0], [1.3, -0.6, 0.1]]
