@@ -49,10 +49,8 @@ def run(options: argparse.Namespace) -> None:
     failed = f", {done.failed} without a pose" if done.failed else ""
     interrupts.print_output(f"{options.out}: {done.pictures} pictures, {done.converged} converged{failed}")
     if done.failed == done.pictures:
-        others = "" if done.failed == 1 else f" (the others: {options.out})"
-        raise WorkError(
-            f"{options.images}: expected a picture with a pose to be found, found none: {done.reason}{others}"
-        )
+        others = "" if done.failed == 1 else f"; {options.out} says why of the others"
+        raise WorkError(f"expected a picture with a pose to be found, found none: {done.reason}{others}")
 
 
 def _within(text: str) -> tuple[float, float]:

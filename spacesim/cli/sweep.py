@@ -18,7 +18,9 @@ def add_options(parser: Parser, arguments: Sequence[str]) -> None:
     add_view(parser)
     path = parser.add_mutually_exclusive_group()
     path.add_argument("--elevation", type=float, metavar="DEG", help="the Sun goes round at this elevation (30)")
-    path.add_argument("--azimuth", type=float, metavar="DEG", help="the Sun goes over the zenith from the horizon here")
+    path.add_argument(
+        "--azimuth", type=float, metavar="DEG", help="the Sun goes over the zenith, from the horizon at this azimuth"
+    )
     parser.add_argument("--frames", type=int, metavar="N", help="Suns, evenly around the circle (72)")
     parser.add_argument("--kind", choices=("rgb", "shadow"), default="rgb")
     parser.add_argument("--exposure", type=float, metavar="EV", help="of a run in linear light (that of its pictures)")

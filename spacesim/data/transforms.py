@@ -132,7 +132,7 @@ def read_camera(path: Path) -> Camera:
     frames = values.pop("frames", None)
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         values |= frames[0]
-        _log.info("%s: the camera is its first frame's, %s", path, values.get("file_path"))
+        _log.info("%s: the camera is its first frame's, %s", path, values.get("file_path", "which has no name"))
     values = _without_nulls(values)
     try:
         if "w" not in values or "h" not in values:

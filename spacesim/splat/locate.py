@@ -34,7 +34,7 @@ class Located:
     pictures: int  #: in all
     converged: int  #: of which the pose may be trusted
     failed: int  #: that have no pose
-    reason: str = ""  #: why the first of these has none
+    reason: str = ""  #: which picture is the first of these, and why it has none
 
 
 def locate(
@@ -102,8 +102,9 @@ def locate(
     finally:
         _write(out, settings, entries)
     trusted = sum(bool(entry.get("converged")) for entry in entries.values())
-    reasons = [f"{name}: {entry['failed']}" for name, entry in entries.items() if "failed" in entry]
-    return Located(len(frames), trusted, len(reasons), reasons[0] if reasons else "")
+    failures = {name: str(entry["failed"]) for name, entry in entries.items() if "failed" in entry}
+    name, reason = next(iter(failures.items()), ("", ""))
+    return Located(len(frames), trusted, len(failures), reason if name in reason else f"{name}: {reason}")
 
 
 def _frames(

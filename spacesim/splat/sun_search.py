@@ -58,7 +58,7 @@ class SunEstimate:
 
     direction: Array  #: [3] unit, world axes, towards the Sun
     #: degrees: root mean square angle to the other Suns that would do, by how well they do. It suits models trained to
-    #: the end; errors of those trained less, or of other pictures than those they learned from, may be larger
+    #: the end; errors of those trained less, or of pictures by other cameras, may be larger
     sigma_deg: float
     loss: float  #: of Cauchy, summed over blocks of pixels, lower is better
 

@@ -247,7 +247,7 @@ def test_an_opaque_picture_needs_no_files_beside_it(spacesim, tiny_run, tiny_dat
     picture.write_bytes(b"no picture")
     done = spacesim("locate", tiny_run, picture, "--out", tmp_path / "none.json")
     assert done.code == 1
-    assert re.search(r"found none: opaque\.png: .*picture", done.errors[-1])
+    assert re.search(r"found none: \S+opaque\.png: expected PNG, JPEG", done.errors[-1])
 
 
 def test_a_datasets_own_poses_are_not_looked_at(tiny_run, tiny_data):

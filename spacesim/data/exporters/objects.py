@@ -44,7 +44,7 @@ def labelled_objects(dataset: Dataset) -> list[LabelledObject]:
     distinguish them."""
     path = dataset.root / "scene.json"
     if not dataset.scene:
-        expected = "expected data that `spacesim generate` made, as no other has labels of objects"
+        expected = "expected data that `spacesim generate` made, whose objects are known"
         raise InputError(f"{dataset.root}: {expected}, found no scene.json")
     try:
         objects, counts = dataset.scene["objects"], dataset.scene["mesh"]

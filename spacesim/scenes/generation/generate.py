@@ -24,7 +24,7 @@ from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import DEPTH_UNIT, DatasetWriter, FrameWriter, WrittenFrame, choose_depth_unit
 from spacesim.data.transforms import MILLIMETRE, earth_keys
 from spacesim.scenes.build import build
-from spacesim.scenes.cameras.rig import PlannedView, TargetSphere, plan
+from spacesim.scenes.cameras.rig import PlannedView, RigConfig, TargetSphere, plan
 from spacesim.scenes.cameras.sphere_rigs import RandomRig
 from spacesim.scenes.config import QualityConfig, SceneConfig
 from spacesim.scenes.generation.estimate import LONG, Estimate, measure, samples
@@ -95,7 +95,7 @@ def generate(
             written=written,
         )
         eclipsed = {name: keys.get("sun_visibility") == 0 for name, keys in more.items()}
-        warn_of_dark_frames(sunlit, eclipsed, _against_dark_frames(config))
+        warn_of_dark_frames(sunlit, eclipsed, _against_dark_frames(config), isinstance(config.rig, RigConfig))
         return dataset
 
 

@@ -52,10 +52,13 @@ def _resized(camera: Camera, factor: float) -> Camera:
     )
 
 
-def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[str, bool], hint: str) -> None:
+def warn_of_dark_frames(
+    sunlit: Mapping[str, float | None], eclipsed: Mapping[str, bool], hint: str, looks_at_it: bool
+) -> None:
     """Log one warning that counts the frames without an object or without sunlight on it.
 
-    eclipsed: frames of which the Earth hides all of the Sun; hint: what avoids dark frames
+    eclipsed: frames of which the Earth hides all of the Sun; hint: what avoids dark frames; looks_at_it: whether
+    cameras are made to look at the object, not given
     """
     empty = [name for name, share in sunlit.items() if share is None]
     dark = [name for name, share in sunlit.items() if share is not None and share < DARK]
@@ -67,6 +70,7 @@ def warn_of_dark_frames(sunlit: Mapping[str, float | None], eclipsed: Mapping[st
     if empty:
         words.append(f"{len(empty)} of {len(sunlit)} frames show no object ({empty[0]} first)")
     if len(empty) == len(sunlit):
-        hints = ["check which way attitudes turn, and whether lengths are in m or km"]
+        given = "check which way attitudes turn, and whether lengths are in m or km"
+        hints = ["it is smaller than a pixel, most likely" if looks_at_it else given]
     if words:
         _log.warning("generate: %s", "; ".join([*words, *hints]))

@@ -200,12 +200,14 @@ def _csv(path: Path, content: bytes) -> Columns:
     try:
         text = content.decode("utf-8-sig")
         lines = [line for line in io.StringIO(text, newline="") if line.strip() and not line.lstrip().startswith("#")]
+        first = lines[0] if lines else ""
+        other = max(";|\t", key=first.count)
+        if first.count(other) > first.count(","):
+            raise InputError(f"{path}: expected commas between columns, found {other!r}")
         rows = list(csv.reader(lines, skipinitialspace=True, strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected CSV in UTF-8, found something else ({error})") from None
     header = [name.strip() for name in rows[0]] if rows else []
-    if len(header) == 1 and (other := next((mark for mark in ";\t" if mark in header[0]), None)):
-        raise InputError(f"{path}: expected commas between columns, found {other!r}")
     twice = next((name for name in header if header.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"{path}: expected each column once, found {twice!r} twice")

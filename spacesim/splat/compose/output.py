@@ -88,12 +88,11 @@ def compose(
 
 
 def _warn_of_a_cut(scene: PosedScene) -> None:
-    """Where the film, of which each picture is shown for 1 / fps seconds, ends before the last keyframe."""
+    """Where a film, of which each picture is shown for 1 / fps seconds, ends before the last keyframe."""
     last = scene.keyframes[-1].time if scene.keyframes else 0.0
-    if scene.frames + 0.5 < last * scene.fps:
+    if 1 < scene.frames < last * scene.fps - 0.5:
         log.warning(
-            "%s: %d frames at %g a second end at %.4g s, before the last keyframe at %.4g s; without `frames` it is "
-            "reached",
+            "%s: %d frames at %g a second end at %.4g s, before the last keyframe at %.4g s",
             scene.composition.path or "scene",
             scene.frames,
             scene.fps,

@@ -115,7 +115,7 @@ def mesh_of_depths(
     size = float(np.linalg.norm(box[1] - box[0]))
     voxel = config.voxel or size / config.voxels
     if voxel > COARSE * size:
-        _log.warning("voxel: %.3g m is too coarse for an object of %.3g m; take less than a tenth of it", voxel, size)
+        _log.warning("voxel: %.3g m is too coarse for an object of %.3g m; take less than a tenth of that", voxel, size)
     grid = Grid.around(*box, voxel, (config.truncation + 1) * voxel)
     check_memory(grid)
     field = fuse(views, grid, config.truncation, progress=lambda done: report(len(views) + done))

@@ -312,6 +312,11 @@ def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
         "generate: 1 of 1 frames show no object (train_00000 first); check which way attitudes turn, and whether "
         "lengths are in m or km"
     ]
+    caplog.clear()
+    far = read_scene("boxsat", resolution=(8, 8), spp=1, points=50, distance=1e5, views=1, test_views=1)
+    generate(far, tmp_path / "far")
+    expected = "generate: 2 of 2 frames show no object (train_00000 first); it is smaller than a pixel, most likely"
+    assert expected in [record.message for record in caplog.records]
 
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)

@@ -139,6 +139,8 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, name, columns, message)
         ("a.csv", b"", "expected a header and at least one row, found nothing"),
         ("a.csv", b"time_s,camera_x_m\n1\n", "expected 2 values in row 1, found 1"),
         ("a.csv", b"time_s;camera_x_m\n1;2,5\n", "a.csv: expected commas between columns, found ';'$"),
+        ("a.csv", b'"time_s";"camera_x_m"\n1;2\n', "a.csv: expected commas between columns, found ';'$"),
+        ("a.csv", b"time_s|camera_x_m|b, c\n1|2|3\n", "a.csv: expected commas between columns, found '.'$"),
         ("a.csv", b"time_s\tcamera_x_m\n1\t2\n", "a.csv: expected commas between columns, found '.t'$"),
         ("a.csv", b"time_s,time_s\n1,2\n", "expected each column once, found 'time_s' twice"),
         ("a.csv", b'time_s\n"1\n', "expected CSV in UTF-8, found something else"),

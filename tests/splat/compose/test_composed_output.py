@@ -153,9 +153,11 @@ def test_frames_that_end_before_the_last_keyframe_are_warned_of(tmp_path, caplog
     assert caplog.records == []
     compose(replace(whole, frames=2), tmp_path / "out")
     assert [record.getMessage() for record in caplog.records] == [
-        "scene: 2 frames at 24 a second end at 0.08333 s, before the last keyframe at 0.125 s; without `frames` it is "
-        "reached"
+        "scene: 2 frames at 24 a second end at 0.08333 s, before the last keyframe at 0.125 s"
     ]
+    caplog.clear()
+    compose(replace(whole, frames=1), tmp_path / "still")
+    assert caplog.records == []
 
 
 def test_without_an_encoder_a_sentence(tmp_path, monkeypatch):

@@ -278,11 +278,11 @@ def test_rays_are_traced_often_at_first():
 
 
 def test_training_goes_on_to_the_bit_between_two_looks_around(small_lit_dataset, tmp_path):
-    """Rays are traced anew after 50 and 100 steps, Gaussians come and go; checkpoints fall in between."""
-    config = with_options(preset("demo", "shadow-map"), iterations=130, init_count=200)
-    config = replace(config, refinement=replace(config.refinement, refine_every=40, refine_start=30, refine_stop=110))
-    straight, stops, counts = Trainer(small_lit_dataset, config), (45, 80, 97), set()
-    while straight.iteration < 125:
+    """Rays are traced anew after 50 and 200 steps, Gaussians come and go; checkpoints fall in between."""
+    config = with_options(preset("demo", "shadow-map"), iterations=230, init_count=200)
+    config = replace(config, refinement=replace(config.refinement, refine_every=40, refine_start=30, refine_stop=210))
+    straight, stops, counts = Trainer(small_lit_dataset, config), (45, 120, 190), set()
+    while straight.iteration < 220:
         straight.step()
         counts.add(straight.gaussians.count)
         if straight.iteration in stops:
@@ -291,7 +291,7 @@ def test_training_goes_on_to_the_bit_between_two_looks_around(small_lit_dataset,
     for stop in stops:
         resumed = Trainer(small_lit_dataset, config)
         resumed.restore(tmp_path / f"at_{stop}")
-        while resumed.iteration < 125:
+        while resumed.iteration < 220:
             resumed.step()
         for name, value in straight.gaussians.to_numpy().items():
             np.testing.assert_array_equal(value, resumed.gaussians.to_numpy()[name], err_msg=f"{name} from {stop}")
