@@ -104,7 +104,8 @@ class RigConfig(Rig):
     test_views: int = 20
     #: with test Suns of their own, test views of every training Sun beside these, listed after them
     known_test_views: int = 0
-    #: every Sun has the same test cameras, so that pictures differ by their light alone
+    #: every Sun has the same test cameras, so that pictures differ by their light alone; where `test_views` and
+    #: `known_test_views` differ, the fewer are some of the more, evenly spread
     shared_test_views: bool = False
     #: training Suns as (azimuth, elevation), degrees; () the rig's own arrangement of `suns`
     sun: tuple[tuple[float, float], ...] = ()
@@ -132,6 +133,12 @@ class RigConfig(Rig):
         suns = training_suns(self.suns, self.sun)
         return suns, held_out_suns(self.test_suns, seed) if self.test_suns else suns
 
+    @property
+    def shared_cameras(self) -> int | None:
+        """Of how many test cameras some Suns have a part alone; None: each has all of them, or cameras of its own."""
+        counts = self.test_views, self.known_test_views
+        return max(counts) if self.shared_test_views and 0 < min(counts) < max(counts) else None
+
     def all_views(self, suns: tuple[list[Sun], list[Sun]], views: ViewsOf) -> Views:
         """The training and the test views; views: (Sun, views of it, stream of random numbers), whichever set it is.
 
@@ -145,10 +152,11 @@ class RigConfig(Rig):
         view_sets = []
         for purpose, some, count in sets:
             shared = self.shared_test_views and purpose != TRAIN
+            among = (shared and self.shared_cameras) or count
             streams = [(TEST, 0) if shared else (purpose, i) for i in range(len(some))]
-            view_sets.append(
-                [view for sun, stream in zip(some, streams, strict=True) for view in views(sun, count, stream)]
-            )
+            planned = [views(sun, among, stream) for sun, stream in zip(some, streams, strict=True)]
+            chosen = [(2 * i + 1) * among // (2 * count) for i in range(count)]
+            view_sets.append([of_sun[i] for of_sun in planned for i in chosen])
         return view_sets[0], view_sets[1] + view_sets[2]
 
 

@@ -142,6 +142,22 @@ def test_shared_test_views_differ_by_their_light_alone(rig):
     assert nearest(train, test) > 1e-3
 
 
+@pytest.mark.parametrize(("of_test", "of_known"), [(5, 2), (2, 5), (5, 1), (3, 3)])
+def test_shared_test_views_of_two_numbers_are_of_the_same_cameras(of_test, of_known):
+    """So known and unseen Suns are compared on the same views: the fewer are spread among the more."""
+    options = {"suns": 2, "views": 4, "test_suns": 3, "shared_test_views": True}
+    rig = FibonacciRig(**options, test_views=of_test, known_test_views=of_known)
+    assert rig.shared_cameras == (None if of_test == of_known else 5)
+    _, test = plan(rig, TARGET, CAMERA, 1)
+    unseen, known = positions(test)[: 3 * of_test].round(9), positions(test)[3 * of_test :].round(9)
+    assert len(known) == 2 * of_known
+    few, many = sorted((unseen[:of_test], known[:of_known]), key=len)
+    places = [np.flatnonzero((many == one).all(axis=1)).tolist() for one in few]
+    assert places == {5: [[k] for k in range(5)], 3: [[k] for k in range(3)], 2: [[1], [3]], 1: [[2]]}[len(few)]
+    _, whole = plan(FibonacciRig(**options, test_views=len(many), known_test_views=len(many)), TARGET, CAMERA, 1)
+    np.testing.assert_array_equal(positions(whole)[: len(many)].round(9), many)
+
+
 def test_scene_json_names_such_views_only_where_asked_for():
     plain = read_scene("boxsat").to_json()["rig"]
     asked = read_scene("boxsat", test_suns=2, known_test_views=3, shared_test_views=True).to_json()["rig"]

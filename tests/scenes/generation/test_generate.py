@@ -319,6 +319,19 @@ def test_dark_and_empty_frames_are_counted_in_one_warning(tmp_path, caplog):
     assert expected in [record.message for record in caplog.records]
 
 
+def test_frames_of_other_shared_cameras_are_not_taken_over(tmp_path):
+    """Once the fewer views of a Sun were none of the cameras that others share; frames so made are no part of this."""
+    options = {"test_suns": 1, "test_views": 3, "known_test_views": 1, "shared_test_views": True}
+    config = read_scene("boxsat", resolution=(8, 8), spp=1, points=50, suns=1, views=1, **options)
+    generate(config, tmp_path / "data")
+    path = tmp_path / "data/scene.json"
+    described = json.loads(path.read_text())
+    assert described["test_cameras"] == 3
+    path.write_text(json.dumps({key: value for key, value in described.items() if key != "test_cameras"}))
+    with pytest.raises(InputError, match="was made with test_cameras"):
+        generate(config, tmp_path / "data", resume=True)
+
+
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.0)
 RANDOM = {"resolution": (160, 120), "spp": 1, "points": 50, "distortion": LENS}
 
