@@ -33,10 +33,10 @@ def print_headline(metrics: JsonDict) -> None:
             f"shadows: BER {show('shadow', 'ber', 4)}, boundary MAE {show('shadow', 'boundary_mae', 4)}"
         )
     if metrics.get("shadow_mask"):
-        share, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
-        pooled = metrics["shadow_mask"]["error_rate"]
-        pooled_words = "" if pooled is None else f" ({pooled['pooled']:.4f} over the pixels of all frames)"
-        interrupts.print_output(f"shadow masks: error rate {share}{pooled_words}, balanced {balanced}")
+        mean, balanced = show("shadow_mask", "error_rate", 4), show("shadow_mask", "balanced_error_rate", 4)
+        pooled = (metrics["shadow_mask"]["error_rate"] or {}).get("pooled")
+        share = mean if pooled is None else f"{pooled:.4f} of all pixels (mean of the frames {mean})"
+        interrupts.print_output(f"shadow masks: error rate {share}, balanced {balanced}")
     if metrics.get("shadow_other_cast"):
         share, overlap = show("shadow_other_cast", "balanced_error_rate", 4), show("shadow_other_cast", "iou", 4)
         interrupts.print_output(f"shadows that another object casts: balanced error rate {share}, IoU {overlap}")

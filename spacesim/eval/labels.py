@@ -80,7 +80,7 @@ SHADOW = (
     ),
 )  # fmt: skip
 
-POOLED = "; mean of the frames, and pooled: over the pixels of all frames, whose number differs"
+POOLED = ", of all frames together; beside it the mean of the frames, of which some have few"
 
 SHADOW_MASK = (
     Metric("error_rate", "Error rate", "", LOWER, 4, f"Share of lit and cast-shadow pixels put wrong{POOLED}."),

@@ -102,10 +102,10 @@ def summary_cell(run: Evaluation, group: str, metric: Metric, suns: str = "") ->
 def _cell(value: JsonDict | None, metric: Metric) -> Cell:
     if value is None:
         return None, _NONE, ""
-    spread = f"± {value['std']:.{metric.digits}f}"
-    if "pooled" in value:
-        spread += f"<br>pooled {value['pooled']:.{metric.digits}f}"
-    return value["mean"], f"{value['mean']:.{metric.digits}f}", spread
+    mean, spread = f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
+    if "pooled" in value:  # a frame of few such pixels counts little
+        return value["pooled"], f"{value['pooled']:.{metric.digits}f}", f"frames {mean}<br>{spread}"
+    return value["mean"], mean, spread
 
 
 def best_in_bold(metric: Metric, cells: Sequence[Cell]) -> list[str]:

@@ -153,7 +153,7 @@ def _headlines(runs: Sequence[Evaluation]) -> str:
     lead = f"Image{' and shadow' * shadows} numbers are means over the frames, taken over "
     lead += "whole pictures: no silhouette is known" if whole else "the object's silhouette"
     masks = any(group == "shadow_mask" for group, _ in chosen)
-    lead += "; shadow masks over lit and cast-shadow pixels." if masks else "."
+    lead += "; shadow masks over all frames' lit and cast-shadow pixels." if masks else "."
     lead += fitted_words(runs) + aligned_words(runs)
     return f'<div class="cards{many}">{"".join(cards)}</div><p class="lead">{lead}</p>'
 
