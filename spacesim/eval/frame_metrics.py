@@ -8,7 +8,7 @@ import numpy as np
 
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import Array
-from spacesim.data.images import load_image, luminance, read_labels, write_png
+from spacesim.data.images import has_alpha, load_image, luminance, read_labels, write_png
 from spacesim.data.images.tone import (
     PEAK,
     STANDARD_EXPOSURE,
@@ -67,7 +67,10 @@ def frame_target(dataset: Dataset, frame: Frame) -> FrameTarget:
         silhouette, source = read_labels(dataset.root / frame.silhouette_path, frame.camera) > 0, "truth"
     else:
         silhouette = loaded.alpha >= 0.5
-        source = "frame" if np.all(loaded.alpha == 1) else "alpha"
+        if frame.silhouette_path is not None and not has_alpha(dataset.root / frame.file_path):
+            source = "truth"  # undistorted, as its picture
+        else:
+            source = "frame" if np.all(loaded.alpha == 1) else "alpha"
     return FrameTarget(loaded, silhouette & loaded.valid, source)
 
 

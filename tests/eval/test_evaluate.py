@@ -385,6 +385,18 @@ def test_data_without_truth_is_scored_over_alpha(make_run, dataset, tmp_path):
     assert "In 4 of 4 frames the silhouette is where the image's alpha is at least one half." in metrics["notes"]
 
 
+def test_silhouettes_of_a_lens_are_no_alpha(make_run, dataset, tmp_path):
+    bent = elsewhere(dataset, gt_path=None, distortion=(0.01, 0.0, 0.0, 0.0, 0.0))
+    alpha = "In 4 of 4 frames the silhouette is where the image's alpha is at least one half."
+    assert alpha in evaluate(make_run(shifted), bent, tmp_path / "alpha")["notes"]
+    for frame in bent.test:
+        path = bent.root / frame.file_path
+        write_png(path, np.ascontiguousarray(read_png(path)[..., :3]))
+    metrics = evaluate(make_run(shifted), bent, tmp_path / "eval")
+    assert metrics["image_region"] == "silhouette"
+    assert not any("alpha" in note for note in metrics["notes"])
+
+
 def test_data_without_alpha_is_scored_over_whole_frames(make_run, dataset, tmp_path):
     for frame in dataset.test:
         path = dataset.root / frame.file_path
