@@ -43,6 +43,9 @@ def load_scene(
     """
     path = as_path(path, "path")
     document = toml.read_document(path)
+    if "objects" in document.values and "models" not in document.values:
+        label = document.label(("objects",))
+        raise InputError(f"{label}: expected [[models]], found [[objects]], which generate takes")
     entry = structure(SceneEntry, document, RULES)
     names = _names(entry.models, document)
     runs: dict[Path, Any] = {}

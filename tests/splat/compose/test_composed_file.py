@@ -260,6 +260,10 @@ def test_a_saved_orbit_and_a_scene_without_camera_and_sun(tmp_path):
     [
         ("", "models"),
         ("models = []", "models"),
+        (
+            "seed = 1\n[[objects]]\nspacecraft = 'boxsat'",
+            "line 2: objects: expected [[models]], found [[objects]], which generate takes",
+        ),
         ('[[models]]\nname = "a"', "line 1: models[0].run: expected the folder of a run, found none"),
         (f'{HEAD}[[models]]\nrun = "runs/none"', "line 4: models[1].run: "),
         (f'{HEAD}name = "a"\n[[models]]\nrun = "runs/old"\nname = "a"', "line 6: models[1].name"),
