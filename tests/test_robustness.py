@@ -319,16 +319,33 @@ def test_a_truncated_exr_is_found(broken, fraction):
 
 @pytest.mark.parametrize("name", ["scene.json", "transforms.json"])
 def test_a_truncated_json_file_is_refused_with_a_remedy(spacesim, broken, tiny_data, name):
-    """`verify` and `--resume` say: delete it, resume. That works, and gives the same bytes."""
+    """`verify` and `--resume` say: delete scene.json, resume. That works, and gives the same bytes."""
     cut(broken / name)
     arguments = ("generate", "boxsat", "--out", broken, *GENERATE, "--resume")
-    assert spacesim("verify", broken).is_refusal(broken / name, "delete", "resume")
+    found = spacesim("verify", broken)
+    assert found.is_refusal(broken / name, "of the same scene with --resume makes it again")
+    assert ("delete it" in found.errors[0]) == (name == "scene.json")
     if name == "scene.json":
         assert spacesim(*arguments).is_refusal(broken / name, "delete this file and resume again")
-    (broken / name).unlink()
+        (broken / name).unlink()
     (broken / "gt/train_00001.exr").unlink()
     done = spacesim(*arguments)
     assert done.code == 0, done.errors
+    assert contents(broken) == contents(tiny_data)
+
+
+@pytest.mark.parametrize(("name", "text"), [("scene.json", '{"config": {}}'), ("SHA256SUMS", "x"), ("points.ply", "x")])
+def test_what_verify_says_to_delete_is_what_resume_needs(spacesim, broken, tiny_data, name, text):
+    (broken / name).write_text(text)
+    found, arguments = spacesim("verify", broken), ("generate", "boxsat", "--out", broken, *GENERATE, "--resume")
+    assert found.errors[-1].endswith("1 faulty file; generate of the same scene with --resume makes them again")
+    if name != "points.ply":
+        assert found.errors[0].endswith("; delete it")
+        assert spacesim(*arguments).is_refusal(broken)
+        (broken / name).unlink()
+    else:
+        assert "delete" not in " ".join(found.errors)
+    assert spacesim(*arguments).code == 0
     assert contents(broken) == contents(tiny_data)
 
 

@@ -24,7 +24,9 @@ def verify_files(path: Path) -> tuple[Dataset, list[str]]:
         changed = check_manifest(dataset.root)
         listed = read_manifest(dataset.root)
     except InputError as error:
-        return dataset, [str(error)]
+        return dataset, [f"{error}; delete it" if dataset.scene else str(error)]
+    if dataset.scene and "scene.json" in changed:
+        changed["scene.json"] += "; delete it"
     absent = sorted(_named(dataset) - listed.keys()) if listed else []
     changed |= {name: f"{dataset.root / NAME}: expected a digest of {name}, found none" for name in absent}
     reported = tuple(f"{dataset.root / name}:" for name in changed)
@@ -50,16 +52,17 @@ def has_digests(dataset: Dataset) -> bool:
 def repair_hint(dataset: Dataset) -> str:
     """What to do about faulty files of a dataset, by what has made it; "" where that is not known."""
     if dataset.scene:
-        return "; delete them, generate with resume=True makes them again"
+        return "; generate of the same scene with resume=True makes them again"
     return "; import it again, into a new folder" if (dataset.root / SOURCE).is_file() else ""
 
 
 def _repair_hint(root: Path, error: InputError) -> str:
     """What to do about a broken scene.json or transforms.json of a dataset that `generate` has made."""
-    broken = (path for path in (root / "scene.json", root / "transforms.json") if str(path) in str(error))
-    if (root / "scene.json").is_file() and any(path.is_file() for path in broken):
-        return "; delete it, generate of the same scene with resume=True makes it again"
-    return ""
+    broken = [name for name in ("scene.json", "transforms.json") if str(root / name) in str(error)]
+    if not (root / "scene.json").is_file() or not any((root / name).is_file() for name in broken):
+        return ""
+    first = "delete it, " if "scene.json" in broken else ""  # else nothing is resumed
+    return f"; {first}generate of the same scene with resume=True makes it again"
 
 
 def _faulty_pictures(dataset: Dataset) -> list[str]:
