@@ -447,9 +447,9 @@ def test_few_gaussians_at_the_end_are_warned_of():
         return [{"iteration": 50.0 * k, "loss": 0.1, "gaussians": count} for k, count in enumerate(counts)]
 
     assert (
-        few_left_warning([]) == few_left_warning(history(8000, 300, 800)) == few_left_warning(history(50, 9000)) == ""
+        few_left_warning([]) == few_left_warning(history(8000, 300, 2000)) == few_left_warning(history(50, 9000)) == ""
     )
-    assert few_left_warning(history(8000, 4000, 799)).startswith("799 Gaussians are left of 8000")
+    assert few_left_warning(history(8000, 4000, 1999)).startswith("1999 Gaussians are left of 8000")
 
 
 def test_ply_round_trip(finished, tmp_path):
