@@ -59,10 +59,11 @@ class Rendering:
         """[H, W] float32: expected depth along the optical axis, metres; 0 where alpha is 0."""
         return self._drawn.depth
 
-    @property
+    @cached_property
     def visibility(self) -> np.ndarray | None:
         """[H, W] float32: the share of the Sun that the surface sees, 0 to 1; None of a method without shadows."""
-        return self._drawn.visibility
+        seen = self._drawn.visibility
+        return None if seen is None else np.clip(seen, 0, 1)  # a sum of weights over their sum is rounded
 
     @cached_property
     def normal(self) -> np.ndarray:

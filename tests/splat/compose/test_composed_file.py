@@ -221,6 +221,15 @@ def test_a_scene_is_seen_as_arrays(tmp_path):
         PosedScene(scene.composition).render()
 
 
+def test_arrays_show_no_more_than_all_of_the_sun(monkeypatch):
+    run, camera = made_run("map"), seen_from([4, 0, 1])
+    drawn = run.predict(camera, Sun(np.array([0.3, 0.2, 0.9])))
+    rounded = replace(drawn, visibility=drawn.visibility + 0.01)
+    monkeypatch.setattr(Run, "predict", lambda *_, **__: rounded)
+    assert rounded.visibility.max() > 1
+    assert run.render(camera, sun=[0.3, 0.2, 0.9]).visibility.max() == 1
+
+
 def test_a_saved_scene_gives_the_same_pictures_to_the_bit(tmp_path):
     scene = whole_scene(tmp_path)
     save_scene(tmp_path / "saved.toml", scene)
