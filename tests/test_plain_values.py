@@ -125,7 +125,7 @@ def test_impossible_pictures_are_refused(tiny_run, tiny_data, tmp_path):
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, np.nan], [0, 0, 0], 4, 4, 40)),
         (r"position: expected three finite numbers", lambda: ss.Camera.look_at(["a"] * 3, [0, 0, 0], 4, 4, 40)),
         (r"target: expected three finite numbers", lambda: ss.Camera.look_at([0, 0, 1], "abc", 4, 4, 40)),
-        (r"world_from_camera: expected a finite", lambda: ss.PoseRig(np.full((2, 4, 4), np.nan))),
+        (r"world_from_camera\[0\]: expected a \[4, 4\] matrix", lambda: ss.PoseRig(np.full((2, 4, 4), np.nan))),
         (r".*: expected a folder for an evaluation, found a dataset", lambda: ss.evaluate(run, tiny_data, tiny_data)),
     ]
     for said, call in wrong:
