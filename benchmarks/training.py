@@ -138,10 +138,11 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
         trainer = still_trainer(dataset, count)
         ours, pairs = list[float](), list[tuple[float, float]]()
         for _ in range(ROUNDS):
-            ours += common.seconds({"spacesim": trainer.step}, -(-repeats // ROUNDS), WARM_UP)["spacesim"]
+            steps = {"spacesim": in_a_row(trainer.step)}
+            ours += common.seconds(steps, -(-repeats // ROUNDS), -(-WARM_UP // IN_A_ROW))["spacesim"]
             if binary is not None:
                 pairs.append(peer_opensplat.run_pair(binary, dataset))
-    row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(ours)}
+    row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(np.array(ours) / IN_A_ROW)}
     if binary is None:
         return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
     peer = common.Timing.of(peer_opensplat.seconds_a_step(pairs))
