@@ -1,7 +1,8 @@
 """gsplat as the peer of the benchmarks: the same splats, the same camera, its own rasterizer and torch around it.
 
 gsplat (https://github.com/nerfstudio-project/gsplat), 1.5.3 or main at 90d7b4b, and torch with CUDA are needed, which
-spacesim does not install: `pip install gsplat==1.5.3`. gsplat compiles its kernels at first use.
+spacesim does not install: `pip install gsplat==1.5.3`, or its repository at that commit. It compiles its
+kernels at first use.
 """
 
 from typing import Any

@@ -104,7 +104,7 @@ def _cell(value: JsonDict | None, metric: Metric) -> Cell:
         return None, _NONE, ""
     mean, spread = f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
     if "pooled" in value:  # a frame of few such pixels counts little
-        return value["pooled"], f"{value['pooled']:.{metric.digits}f}", f"frames {mean}<br>{spread}"
+        return value["pooled"], f"{value['pooled']:.{metric.digits}f}", f"mean of frames {mean}<br>{spread}"
     return value["mean"], mean, spread
 
 
