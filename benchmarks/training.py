@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rasterizer import add_peers_option, load_peers
 from support import common, counters, floors, growth, peer_opensplat
 from support.pipeline import SSIM_WEIGHT, Pipeline
@@ -96,9 +95,7 @@ def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> 
         for name, peer in peers.items():
             steps = peer.steps((arrays, views, RATES, SSIM_WEIGHT))
             works |= {f"{name}, {label}": step for label, step in steps.items()}
-        rows = {label: in_a_row(step) for label, step in works.items()}
-        seconds = common.seconds(rows, repeats, -(-WARM_UP // IN_A_ROW))
-        times = {label: common.Timing.of(np.array(some) / IN_A_ROW) for label, some in seconds.items()}
+        times = {label: common.Timing.of(seconds) for label, seconds in step_seconds(works, repeats).items()}
         kernels = common.kernels(trainer.step)
     if trainer.gaussians.count != count or trainer.iteration >= NEVER:
         raise AssertionError("a step of the benchmark has refined")
@@ -107,6 +104,13 @@ def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> 
     result |= {"kernels": kernels.milliseconds, "launches": kernels.launches}
     result["ratios"] = {k: times["spacesim"].median / t.median for k, t in times.items() if k != "spacesim"}
     return result
+
+
+def step_seconds(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+    """Of a step of each work, `IN_A_ROW` of them timed together."""
+    rows = {label: in_a_row(step) for label, step in works.items()}
+    seconds = common.seconds(rows, repeats, -(-WARM_UP // IN_A_ROW))
+    return {label: [row / IN_A_ROW for row in some] for label, some in seconds.items()}
 
 
 def in_a_row(step: Callable[[], Any]) -> Callable[[], None]:
@@ -138,11 +142,10 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
         trainer = still_trainer(dataset, count)
         ours, pairs = list[float](), list[tuple[float, float]]()
         for _ in range(ROUNDS):
-            steps = {"spacesim": in_a_row(trainer.step)}
-            ours += common.seconds(steps, -(-repeats // ROUNDS), -(-WARM_UP // IN_A_ROW))["spacesim"]
+            ours += step_seconds({"spacesim": trainer.step}, -(-repeats // ROUNDS))["spacesim"]
             if binary is not None:
                 pairs.append(peer_opensplat.run_pair(binary, dataset))
-    row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(np.array(ours) / IN_A_ROW)}
+    row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(ours)}
     if binary is None:
         return row | {"OpenSplat": "not measured here: needs the binary", "ours / theirs": "-"}
     peer = common.Timing.of(peer_opensplat.seconds_a_step(pairs))
