@@ -80,6 +80,11 @@ class Rig(ABC):
         """What it reads."""
         return ()
 
+    @property
+    def shared_cameras(self) -> int | None:
+        """Of how many test cameras some Suns have a part alone; None: each has all of them, or cameras of its own."""
+        return None
+
     def to_json(self) -> JsonDict:
         """What scene.json says of it: plain values. Raises InputError for others."""
         values = asdict(self)
@@ -135,7 +140,6 @@ class RigConfig(Rig):
 
     @property
     def shared_cameras(self) -> int | None:
-        """Of how many test cameras some Suns have a part alone; None: each has all of them, or cameras of its own."""
         counts = self.test_views, self.known_test_views
         return max(counts) if self.shared_test_views and 0 < min(counts) < max(counts) else None
 

@@ -392,7 +392,7 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         "mesh": [_mesh_counts(scene, i) for i in range(1, len(scene.objects) + 1)],
         "suns": {"train": _angles(train), "test": _angles(test)},
         **({DEPTH_UNIT: unit} if (unit := depth_unit(scene, [*train, *test])) != MILLIMETRE else {}),
-        **({"test_cameras": cameras} if (cameras := _shared_cameras(config)) else {}),
+        **({"test_cameras": cameras} if (cameras := config.rig.shared_cameras) else {}),
         "exposure": config.camera.exposure,
         "seed": config.seed,
         "spp": config.quality.spp,
@@ -401,10 +401,6 @@ def describe(scene: Scene, config: SceneConfig, train: NamedViews, test: NamedVi
         "backend": backend.select(),
         "versions": versions(),
     }
-
-
-def _shared_cameras(config: SceneConfig) -> int | None:
-    return config.rig.shared_cameras if isinstance(config.rig, RigConfig) else None
 
 
 def depth_unit(scene: Scene, named: NamedViews) -> float:
