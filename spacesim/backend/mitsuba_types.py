@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         DirectionSample3f,
         Interaction3f,
         Mesh,
+        PreliminaryIntersection3f,
         Sampler,
         Scene,
         ShapePtr,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     SurfaceInteraction3f: TypeAlias = Any
 else:
     BSDF = Color3f = DirectionSample3f = Integrator = Interaction3f = Mesh = Point2f = Point3f = RayDifferential3f = Any
-    Sampler = Scene = ShapePtr = SurfaceInteraction3f = Vector3f = Any
+    PreliminaryIntersection3f = Sampler = Scene = ShapePtr = SurfaceInteraction3f = Vector3f = Any
 
 __all__ = [
     "BSDF",
@@ -39,6 +40,7 @@ __all__ = [
     "Mesh",
     "Point2f",
     "Point3f",
+    "PreliminaryIntersection3f",
     "RayDifferential3f",
     "Sampler",
     "Scene",

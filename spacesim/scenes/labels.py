@@ -39,7 +39,7 @@ class Labeller:
     def __init__(self, scene: Scene, loaded: MitsubaScene, distortion: Sequence[float]) -> None:
         self._scene = loaded.labelled
         self._units = loaded.units
-        self._parts = PartTable.of(scene, self._scene)
+        self._parts = PartTable.of(scene, loaded)
         self._sun = loaded.sun
         self._directions = SolarDirections(scene.sun)
         self._centres = record_on_cuda(partial(_trace_centres, tuple(distortion)))
@@ -100,14 +100,14 @@ def _trace_centres(
     hit = surface.is_valid()
     normal = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
     cosine = dr.select(hit, dr.dot(normal, sun), 0.0)
-    object_id, part_id = parts.ids(surface.shape, hit)
+    object_id, part_id = parts.ids(surface, hit)
     distance = dr.select(hit, (before + surface.t) * view.metre, 0.0)
     numbers: list[Float | mt.Vector3f] = [
         distance * dr.dot(ray.d, view.forward),
         distance,
         cosine,
         dr.select(hit, normal, 0.0),
-        parts.albedo(surface, hit),
+        parts.albedo(surface, part_id, hit),
     ]
     points = _Points(surface.p + OFFSET * normal, normal, object_id)
     dr.eval(numbers, part_id, points)  # in one kernel
@@ -142,8 +142,8 @@ def _sun_visibility(
 ) -> tuple[Float, UInt32]:
     """(visibility, shadow classes), [N], of points; 0 and a cast shadow where not `active`."""
     mi = backend.mitsuba()
-    free, hidden, shape = disc.seen(scene, points.origin, points.normal, active)
-    blocker, _ = parts.ids(shape, hidden)
+    free, hidden, hit = disc.seen(scene, points.origin, points.normal, active)
+    blocker, _ = parts.ids(hit, hidden)
     order = disc.count - dr.arange(mi.UInt32, dr.width(free)) % disc.count  # the first that is hidden says by what
     share, by = dr.select(free, mi.Float(1.0), 0.0), dr.select(hidden, (order << 8) | blocker, 0)
     dr.eval(share, by)  # one kernel
@@ -171,43 +171,46 @@ class _Points:
 
 @dataclass(frozen=True)
 class PartTable:
-    """Labels of parts, each indexed by the number that Dr.Jit knows a shape by; inputs of kernels."""
+    """Labels of parts; inputs of kernels. Faces are counted over all shapes, parts from 1, 0 where there is none."""
 
-    objects: UInt32  #: [S] numbers of the objects, from 1; 0 where there is no part
-    parts: UInt32  #: [S] numbers of the parts, from 1; 0 where there is none
-    albedos: Float  #: [3 S] mean linear camera RGB
-    textured: Bool | None  #: whose albedo varies over them, None where no part's does
+    first_face: UInt32  #: [S] of each shape, indexed by the number that Dr.Jit knows it by
+    parts: UInt32  #: [F] number of each face's part
+    objects: UInt32  #: [P + 1] number of each part's object, from 1
+    albedos: Float  #: [3 (P + 1)] mean linear camera RGB of each part
+    textured: Bool | None  #: [P + 1] whose albedo varies over them, None where no part's does
 
     @classmethod
-    def of(cls, scene: Scene, loaded: mt.Scene) -> "PartTable":
+    def of(cls, scene: Scene, loaded: MitsubaScene) -> "PartTable":
         mi = backend.mitsuba()
-        shapes: dict[str, int] = {}
-        for shape in loaded.shapes():
-            shapes[shape.id()] = int(_numbers(mi.ShapePtr(shape))[0])
-        size = max(shapes.values()) + 1
-        objects, parts = np.zeros((2, size), np.uint32)
-        albedos, textured = np.zeros((size, 3), np.float32), np.zeros(size, bool)
+        shapes = {int(_numbers(mi.ShapePtr(shape))[0]): shape.id() for shape in loaded.labelled.shapes()}
+        first_face, parts = np.zeros(max(shapes) + 1, np.uint32), list[np.ndarray]()
+        for number, name in shapes.items():
+            first_face[number] = sum(map(len, parts))
+            parts.append(loaded.parts_of[name])
+        size = len(scene.parts) + 1
+        objects, albedos, textured = np.zeros(size, np.uint32), np.zeros((size, 3), np.float32), np.zeros(size, bool)
         for placed in scene.parts:
-            index, material = shapes[placed.shape_id], placed.part.material
-            objects[index], parts[index] = placed.object_id, placed.part_id
+            index, material = placed.part_id, placed.part.material
+            objects[index] = placed.object_id
             albedos[index], textured[index] = material.albedo, _has_color_image(material.bsdf)
         varied = upload(textured, mi.Bool) if textured.any() else None
-        return cls(upload(objects, mi.UInt32), upload(parts, mi.UInt32), upload(albedos), varied)
+        faces = upload(np.concatenate(parts), mi.UInt32)
+        return cls(upload(first_face, mi.UInt32), faces, upload(objects, mi.UInt32), upload(albedos), varied)
 
-    def ids(self, shape: mt.ShapePtr, active: Bool) -> tuple[UInt32, UInt32]:
-        """(object id, part id) of shape pointers, 0 where not `active`."""
+    def ids(self, hit: mt.SurfaceInteraction3f | mt.PreliminaryIntersection3f, active: Bool) -> tuple[UInt32, UInt32]:
+        """(object id, part id) of what rays met, 0 where not `active`."""
         mi = backend.mitsuba()
-        index = _numbers(shape)
-        return dr.gather(mi.UInt32, self.objects, index, active), dr.gather(mi.UInt32, self.parts, index, active)
+        first = dr.gather(mi.UInt32, self.first_face, _numbers(hit.shape), active)
+        part = dr.gather(mi.UInt32, self.parts, first + hit.prim_index, active)
+        return dr.gather(mi.UInt32, self.objects, part, active), part
 
-    def albedo(self, surface: mt.SurfaceInteraction3f, active: Bool) -> mt.Color3f:
-        """RGB where rays met the scene, 0 where not `active`."""
+    def albedo(self, surface: mt.SurfaceInteraction3f, part_id: UInt32, active: Bool) -> mt.Color3f:
+        """RGB where rays met parts, 0 where not `active`."""
         mi = backend.mitsuba()
-        index = _numbers(surface.shape)
-        albedo = dr.gather(mi.Color3f, self.albedos, index, active)
+        albedo = dr.gather(mi.Color3f, self.albedos, part_id, active)
         if self.textured is None:
             return albedo
-        varied = dr.gather(mi.Bool, self.textured, index, active)
+        varied = dr.gather(mi.Bool, self.textured, part_id, active)
         return dr.select(varied, surface.bsdf().eval_diffuse_reflectance(surface, varied), albedo)
 
 

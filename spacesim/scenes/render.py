@@ -208,7 +208,10 @@ def _trace_paths(
 
 def _mean_radiance(sums: Sequence[AsyncArray], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance from one source [H, W, 3] and alpha [H, W], means over the samples of each pixel."""
-    total: np.ndarray = sum(values.wait() for values in sums) / np.float32(spp)
+    total = sums[0].wait()  # memory of its own
+    for values in sums[1:]:
+        total += values.wait()
+    total /= np.float32(spp)
     shape = camera.height, camera.width
     return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
 

@@ -32,11 +32,11 @@ class Disc:
 
     def seen(
         self, scene: mt.Scene, origin: mt.Vector3f, normal: mt.Vector3f, active: Bool
-    ) -> tuple[Bool, Bool, mt.ShapePtr]:
+    ) -> tuple[Bool, Bool, mt.PreliminaryIntersection3f]:
         """From points [3, N] with their `normal` on the lit side; `active` says which of them are asked.
 
         Returns for each point and direction, [N count], neighbouring elements taking the same point: whether the Sun is
-        seen there, whether a shape hides it, and the pointer of that shape.
+        seen there, whether a shape hides it, and where the ray meets that.
         """
         mi = backend.mitsuba()
         index = dr.arange(mi.UInt32, self.count * dr.width(active))
@@ -48,7 +48,7 @@ class Disc:
         free = is_active & ~hit.is_valid() & (dr.dot(axis, direction) > 0)
         if self.limb is not None:
             free &= ~self.limb.hides(direction)
-        return free, is_active & hit.is_valid(), hit.shape
+        return free, is_active & hit.is_valid(), hit
 
 
 class SolarDirections:

@@ -15,7 +15,7 @@ from spacesim.scenes.build import build
 from spacesim.scenes.config import MaterialConfig, ObjectConfig, SceneConfig
 from spacesim.scenes.materials.table import lambertian
 from spacesim.scenes.render import Renderer
-from spacesim.scenes.scene import Scene, SceneObject
+from spacesim.scenes.scene import Scene, SceneObject, load
 from spacesim.scenes.spacecraft import Part, Spacecraft, boxsat
 
 
@@ -81,6 +81,36 @@ def test_numbers_do_not_meet_names_that_are_there():
     found = named_materials(Scene("paints", (SceneObject(Spacecraft("craft", parts)),)))
     assert [name for name, _ in found] == ["p", "p_2", "p_3", "p", "p_3"]
     assert [albedo[0] for _, albedo in found] == [0.1, 0.2, 0.3, 0.1, 0.3]
+
+
+def test_parts_that_look_alike_are_one_mesh_and_keep_their_numbers():
+    """Closed and open, flat and smooth, of two materials, in a row across the picture."""
+    red, blue = lambertian("red", (0.7, 0.1, 0.1), "x"), lambertian("blue", (0.1, 0.1, 0.7), "x")
+    parts = []
+    for i in range(12):
+        mesh = trimesh.creation.box((0.6, 0.6, 0.6)).apply_translation([0, i - 5.5, 0])
+        is_open, is_smooth, paint = i % 3 == 1, i % 4 == 2, (red, blue)[i % 2]
+        if is_open:
+            mesh.update_faces(np.arange(12) != np.argmin(mesh.face_normals[:, 0]))  # far from the camera
+        normals = mesh.face_normals[np.repeat(np.arange(len(mesh.faces)), 3)] if is_smooth else None
+        parts.append(Part(f"part{i}", mesh, paint, normals=normals))
+    halves = {"left": tuple(parts[:6]), "right": tuple(parts[6:])}
+    scene = Scene("row", tuple(SceneObject(Spacecraft(name, half)) for name, half in halves.items()))
+    loaded = load(scene)
+    shapes = loaded.labelled.shapes()
+    assert len(shapes) < len(parts)
+    faces = np.concatenate([loaded.parts_of[shape.id()] for shape in shapes])
+    assert [np.sum(faces == i + 1) for i in range(12)] == [len(part.mesh.faces) for part in parts]
+    assert all(len(loaded.parts_of[shape.id()]) == shape.face_count() for shape in shapes)
+
+    camera = Camera.from_fov(look_at(np.array([20.0, 0, 0]), np.zeros(3)), 240, 16, 40.0)
+    truth = Renderer(scene, spp=1).render(camera, Sun(np.array([1.0, 0, 0])), (0,))
+    fronts = np.array([[0.3, i - 5.5, 0.0, 1.0] for i in range(12)]) @ camera.camera_from_world.T
+    column = np.floor(camera.fx * fronts[:, 0] / fronts[:, 2] + camera.cx).astype(int)
+    row = np.floor(camera.fy * fronts[:, 1] / fronts[:, 2] + camera.cy).astype(int)
+    assert truth.part_id[row, column].tolist() == list(range(1, 13))
+    assert truth.object_id[row, column].tolist() == [1] * 6 + [2] * 6
+    np.testing.assert_allclose(truth.albedo[row, column], [part.material.albedo for part in parts], atol=1e-6)
 
 
 def test_a_renderer_is_let_go_of_at_once():
