@@ -40,6 +40,9 @@ def print_headline(metrics: JsonDict) -> None:
     if metrics.get("shadow_other_cast"):
         share, overlap = show("shadow_other_cast", "balanced_error_rate", 4), show("shadow_other_cast", "iou", 4)
         interrupts.print_output(f"shadows that another object casts: balanced error rate {share}, IoU {overlap}")
+    if (metrics.get("depth") or {}).get("mae"):
+        missing = _mean(metrics, "depth", "missing", 4)
+        interrupts.print_output(f"depth: mean error {show('depth', 'mae', 4)} m, missing {missing}")
     if (metrics.get("material") or {}).get("albedo_error"):
         words = f"albedo error {show('material', 'albedo_error', 3)}, normals {show('material', 'normals_deg', 1)}"
         interrupts.print_output(f"materials: {words} degrees")

@@ -28,6 +28,7 @@ from spacesim.data.transforms import check_still
 from spacesim.eval.align import align, as_trained
 from spacesim.eval.fit import predict_by_halves
 from spacesim.eval.frame_metrics import (
+    depth_groups,
     depth_range,
     frame_images,
     frame_light,
@@ -281,7 +282,7 @@ def _evaluate_frame(
     if unknowns:
         named["fitted"] = fitted
     groups = image_groups(view, network, source, photograph)
-    record: JsonDict = named | groups | visibility_groups(light, view)
+    record: JsonDict = named | groups | visibility_groups(light, view) | depth_groups(light, view)
     if objects:
         record["objects"] = object_groups(dataset, frame, objects, view, light, network)
     return FrameResult(frame, record, source, has_known_sun, ignored, tally_grazing(light, view), seconds)

@@ -21,6 +21,7 @@ from spacesim.data.records import Dataset, Frame, Image, Truth
 from spacesim.data.store import SHADOW_NONE, SHADOW_SELF_CAST, load_truth
 from spacesim.eval import pictures
 from spacesim.eval.metrics import grazing, image, lpips, shadow
+from spacesim.eval.metrics.depth import depth_metrics
 from spacesim.eval.metrics.image import Mask
 
 if TYPE_CHECKING:
@@ -164,6 +165,14 @@ def visibility_groups(light: FrameLight, view: FrameImages) -> dict[str, shadow.
             for kind in shadow.KINDS
         },
     }
+
+
+def depth_groups(light: FrameLight, view: FrameImages) -> dict[str, shadow.Metrics | None]:
+    """The frame's values of the group about depth, over pixels whose centre shows an object; None without truth."""
+    if light.truth is None:
+        return {"depth": None}
+    true = light.truth.depth
+    return {"depth": depth_metrics(light.depth, true, view.valid & (light.truth.object_id > 0) & (true > 0))}
 
 
 def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:

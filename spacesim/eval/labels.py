@@ -100,6 +100,16 @@ SHADOW_MASK = (
     ),
 )  # fmt: skip
 
+DEPTH = (
+    Metric(
+        "mae", "Depth MAE", "m", LOWER, 4,
+        "Mean absolute error of the depth along the optical axis, where the run has one.",
+        "the run has no depth there",
+    ),
+    Metric("rmse", "Depth RMSE", "m", LOWER, 4, "Root mean squared error of the same.", "the run has no depth there"),
+    Metric("missing", "Missing", "", LOWER, 4, "Share of the object's pixels whose predicted alpha is below one half."),
+)  # fmt: skip
+
 MATERIAL = (
     Metric(
         "albedo_error", "Albedo error", "", LOWER, 4,
@@ -125,5 +135,6 @@ GROUPS = {
     "shadow_attached": ("over lit pixels and those that face away from the Sun", SHADOW_KIND),
     "shadow_self_cast": ("over lit pixels and shadow that an object casts on itself", SHADOW_KIND),
     "shadow_other_cast": ("over lit pixels and shadow that another object casts", SHADOW_KIND),
+    "depth": ("over the object's pixels", DEPTH),
 }
 """metrics.json's groups: where each is taken and what is in it."""

@@ -107,7 +107,7 @@ def explain_light(
     """
     notes = _explain_suns(known_suns, why_unknown)
     if not by_grazing_angle:
-        notes.append("by_grazing_angle is null: the data has no path-traced truth.")
+        notes.append("depth and by_grazing_angle are null: the data has no path-traced truth.")
     return [*notes, no_sweep] if no_sweep else notes
 
 

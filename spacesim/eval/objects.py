@@ -12,7 +12,7 @@ from spacesim.data.exporters.objects import labelled_objects
 from spacesim.data.files import JsonDict
 from spacesim.data.images import read_png
 from spacesim.data.records import Dataset, Frame
-from spacesim.eval.frame_metrics import FrameImages, FrameLight, image_groups, visibility_groups
+from spacesim.eval.frame_metrics import FrameImages, FrameLight, depth_groups, image_groups, visibility_groups
 from spacesim.eval.metrics import lpips
 from spacesim.eval.metrics.geometry import GeometryConfig, compare_depths, compare_shape
 from spacesim.splat.export.mesh import cameras_around
@@ -20,7 +20,7 @@ from spacesim.splat.export.mesh import cameras_around
 if TYPE_CHECKING:
     from spacesim.splat.run import Predictor
 
-GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_cast")
+GROUPS = ("image", "shadow", "shadow_mask", "shadow_self_cast", "shadow_other_cast", "depth")
 """Of `labels.GROUPS`, those that have a meaning over one object's pixels."""
 
 
@@ -52,7 +52,9 @@ def object_groups(
         mask = (ids == number) & view.valid
         if mask.any():
             alone = replace(view, silhouette=mask, valid=mask)
-            record: JsonDict = {**image_groups(alone, network), **visibility_groups(light, alone)}
+            record: JsonDict = (
+                image_groups(alone, network) | visibility_groups(light, alone) | depth_groups(light, alone)
+            )
             groups[name] = {group: record[group] for group in GROUPS}
     return groups
 

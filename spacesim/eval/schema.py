@@ -45,6 +45,7 @@ class Groups:
     shadow_attached: Group | None = None  #: the same over lit pixels and those that face away from the Sun
     shadow_self_cast: Group | None = None  #: the same over lit pixels and shadow that an object casts on itself
     shadow_other_cast: Group | None = None  #: the same over lit pixels and shadow that another object casts
+    depth: Group | None = None  #: errors of depth over the object's pixels; None without truth
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class ObjectRecord:
     image: Group | None  #: of the picture, over its pixels
     shadow: Group | None  #: of shadow by luminance, over its pixels
     shadow_mask: Group | None  #: of predicted visibility, over its pixels
+    depth: Group | None = None  #: errors of depth, over its pixels; None without truth
     geometry: Geometry | None = None  #: its shape against the truth, of a composed scene
 
 
@@ -135,6 +137,7 @@ class FrameRecord:
     shadow_mask: Values | None  #: those of predicted visibility
     known_sun: bool | None = None  #: whether training has seen its Sun; None where that is not known
     material: Values | None = None  #: errors of albedo and normals; None without truth
+    depth: Values | None = None  #: errors of its depth; None without truth
     depth_range: tuple[float, float] | None = None  #: metres: the ends of its pictures of depth, None: it has none
     ssim: float | None = None  #: at most 1
     lpips: float | None = None  #: None without the network's weights

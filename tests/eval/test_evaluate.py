@@ -313,7 +313,7 @@ def test_methods_without_visibility_have_errors_by_grazing_angle(make_run, datas
     assert metrics["relight"] is None
     poorer = evaluate(make_run(), elsewhere(dataset, gt_path=None), tmp_path / "poorer")
     assert poorer["by_grazing_angle"] is None
-    assert any(note.startswith("by_grazing_angle is null") for note in poorer["notes"])
+    assert any(note.startswith("depth and by_grazing_angle are null") for note in poorer["notes"])
 
 
 def test_visibility_that_is_not_finite_names_the_frame(make_run, dataset, tmp_path):

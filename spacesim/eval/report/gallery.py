@@ -71,9 +71,14 @@ def depths(runs: Sequence[Evaluation]) -> str:
 
     if not _have_scores(runs, score):
         return ""
+
+    def words(frame: JsonMapping) -> str:
+        error = (frame.get("depth") or {}).get("mae")
+        return "" if error is None else f"mean error {error:.3g} m"
+
     truth = all(_has_pictures(run, "depth_truth") for run in runs)
     panels = _DEPTHS if truth else {"depth": _DEPTHS["depth"]}
-    return strips(runs, panels, "depth", score, lambda frame: "")
+    return strips(runs, panels, "depth", score, words)
 
 
 def albedos(runs: Sequence[Evaluation]) -> str:

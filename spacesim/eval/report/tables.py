@@ -3,7 +3,18 @@
 from collections.abc import Sequence
 
 from spacesim.data.files import JsonDict
-from spacesim.eval.labels import GROUPS, IMAGE, MATERIAL, RECALL, SHADOW, SHADOW_KIND, SHADOW_MASK, Metric, metric_of
+from spacesim.eval.labels import (
+    DEPTH,
+    GROUPS,
+    IMAGE,
+    MATERIAL,
+    RECALL,
+    SHADOW,
+    SHADOW_KIND,
+    SHADOW_MASK,
+    Metric,
+    metric_of,
+)
 from spacesim.eval.metrics.shadow import KINDS
 from spacesim.eval.report.html import escape, table
 from spacesim.eval.report.read import Evaluation
@@ -18,6 +29,7 @@ _TABLES: tuple[tuple[str, tuple[Metric, ...], tuple[str, ...], tuple[Metric, ...
     ("Shadow by luminance", SHADOW, ("shadow", "shadow_full"), SHADOW),
     ("Shadow by predicted visibility", SHADOW_MASK, ("shadow_mask",), SHADOW_MASK),
     ("Each kind of shadow by predicted visibility", SHADOW_KIND, tuple(KINDS), (RECALL,)),
+    ("Depth", DEPTH, ("depth",), DEPTH),
     ("Materials", MATERIAL, ("material",), MATERIAL),
 )
 """Caption, columns, groups, and the columns that are explained."""
@@ -26,6 +38,7 @@ _OBJECT_TABLES: tuple[tuple[str, str, tuple[Metric, ...]], ...] = (
     ("image", "image", IMAGE),
     ("shadow by luminance", "shadow", SHADOW),
     ("shadow by predicted visibility", "shadow_mask", SHADOW_MASK),
+    ("depth", "depth", DEPTH),
 )
 """Of each object: caption, group, columns."""
 

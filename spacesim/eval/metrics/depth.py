@@ -1,0 +1,20 @@
+"""How well depth is known: metres along the optical axis, over the object's pixels."""
+
+import numpy as np
+
+from spacesim.eval.metrics.image import Mask
+from spacesim.eval.metrics.shadow import Metrics
+
+
+def depth_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) -> Metrics:
+    """Of depths [H, W], metres, 0 where there is none, over `mask`, [H, W] bool, pixels that have a true one.
+
+    mae, rmse: mean absolute and root mean squared error, metres, over those that have a predicted one (Eigen et al.
+    2014, without a scale); missing: share of those that have none. None over no pixel.
+    """
+    if not mask.any():
+        return dict.fromkeys(("mae", "rmse", "missing"))
+    found = mask & (prediction > 0)
+    error = prediction[found].astype(np.float64) - truth[found]
+    mae, rmse = (float(np.abs(error).mean()), float(np.sqrt((error**2).mean()))) if found.any() else (None, None)
+    return {"mae": mae, "rmse": rmse, "missing": 1 - float(found.sum() / mask.sum())}
