@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,7 @@ from spacesim.data.images import linear_from_srgb, srgb_from_linear
 from spacesim.data.records import Camera, Image, Sun
 from spacesim.splat.compose.aligned import AlignedRun
 from spacesim.splat.pose import checked_picture
-from spacesim.splat.run import Prediction, Predictor, check_gaussians
+from spacesim.splat.run import Prediction, Predictor, Run, check_gaussians
 from spacesim.splat.sun_search import SmallPicture, SunEstimate, SunFinder
 
 SATURATED = 254.5 / 255  #: sRGB value from which on a pixel says only that it is bright
@@ -91,7 +92,8 @@ def estimate_sun(
     camera: of the picture, with its size and intrinsics (no distortion);  mask: [H, W], where not 0 the pixel counts
     Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. All
     directions are compared, shadows included, on a picture of 128 pixels; the picture's exposure is taken for that of
-    the training pictures. Raises InputError where the run knows no Sun, for no such picture, and where none counts.
+    the training pictures. Shadows are cast for the first picture of a run, and kept as long as the run, up to 1 GiB.
+    Raises InputError where the run knows no Sun, for no such picture, and where none counts.
     """
     run = check_gaussians(run)
     if not run.relightable or run.light is None:
@@ -105,7 +107,13 @@ def estimate_sun(
     if rgb[shown].max() < DARK:
         raise InputError("image: expected light on the object, found none")
     picture = SmallPicture.of(camera, Image(rgb, np.ones_like(seen), shown), least=HALF)
-    return SunFinder(run.gaussians, run.light, run.antialiased, run.curve).estimate(picture)
+    if run not in _finders:
+        _finders[run] = SunFinder(run.gaussians, run.light, run.antialiased, run.curve)
+    return _finders[run].estimate(picture)
+
+
+_finders: WeakKeyDictionary[Run, SunFinder] = WeakKeyDictionary()
+"""Of the runs that were asked for Suns: what they know of the lattice's light serves other pictures."""
 
 
 def draw(run: Predictor, camera: Camera, light: PictureLight) -> Prediction:

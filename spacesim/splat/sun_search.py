@@ -48,6 +48,7 @@ AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: shadows, more where no picture is taken against the Sun
 MEAN_COSINES = 0.14, 0.2, 0.28, 0.4, 0.56
 ALTERNATIONS = 2  #: of Suns and albedo
+KEPT_BYTES = 2**30  #: that the light of the whole lattice may take to be kept from one picture to the next
 RINGS = 8.0, 3.0  #: degrees about the best Sun, at which a paraboloid is fitted
 RING = 6  #: Suns of a ring
 
@@ -189,7 +190,7 @@ class SunFinder:
         light = None if number is None else self._sunlight.get(number)
         if light is None:
             light = self.light.sunlight(self.gaussians, direction)
-            if number is not None:
+            if number is not None and SPHERE * light.bytes <= KEPT_BYTES:
                 self._sunlight[number] = light
         return self.light.shade_picture(self.gaussians, camera, direction, sunlight=light)[0]
 

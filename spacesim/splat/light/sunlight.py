@@ -38,3 +38,9 @@ class Sunlight:
     bounced: list[Float]  #: of `bounce.received_on_sides`, Floats [N], or nothing
     #: of `bounce.emission`, where surfaces mirror it, or nothing
     emitted: list[Float] = field(default_factory=list)
+
+    @property
+    def bytes(self) -> int:
+        """Of memory."""
+        rows = [*([] if self.visibility is None else [self.visibility]), *self.bounced, *self.emitted]
+        return 4 * sum(map(dr.width, rows))
