@@ -22,7 +22,7 @@ def print_note(note: str | None) -> None:
 
 
 def print_headline(metrics: JsonDict) -> None:
-    """PSNR, SSIM and shadow errors in a line each."""
+    """A line for each group of metrics: those that people ask for first."""
     show = partial(_mean, metrics)
     whole = metrics.get("image_region") == "frame"
     numbers = f"PSNR {show('image', 'psnr', 2)} dB, SSIM {show('image', 'ssim', 4)}, FLIP {show('image', 'flip', 4)}"
@@ -40,9 +40,10 @@ def print_headline(metrics: JsonDict) -> None:
     if metrics.get("shadow_other_cast"):
         share, overlap = show("shadow_other_cast", "balanced_error_rate", 4), show("shadow_other_cast", "iou", 4)
         interrupts.print_output(f"shadows that another object casts: balanced error rate {share}, IoU {overlap}")
-    if (metrics.get("depth") or {}).get("mae"):
-        missing = _mean(metrics, "depth", "missing", 4)
-        interrupts.print_output(f"depth: mean error {show('depth', 'mae', 4)} m, missing {missing}")
+    if metrics.get("depth"):
+        error = metrics["depth"]["mae"]
+        length = f"{error['mean']:.3g} m" if error else "null"
+        interrupts.print_output(f"depth: mean error {length}, missing {show('depth', 'missing', 4)} of the pixels")
     if (metrics.get("material") or {}).get("albedo_error"):
         words = f"albedo error {show('material', 'albedo_error', 3)}, normals {show('material', 'normals_deg', 1)}"
         interrupts.print_output(f"materials: {words} degrees")

@@ -100,7 +100,7 @@ def frame_images(
 def frame_light(dataset: Dataset, frame: Frame, prediction: "Prediction") -> FrameLight:
     """Raises InputError where the truth that the dataset names is missing or broken."""
     truth = None if frame.gt_path is None else load_truth(dataset, frame)
-    depth = np.where(prediction.alpha >= 0.5, np.nan_to_num(prediction.depth), 0)
+    depth = np.where(prediction.alpha >= 0.5, np.nan_to_num(prediction.depth, posinf=0, neginf=0), 0)
     return FrameLight(truth, prediction.visibility, prediction.alpha, depth)
 
 
@@ -171,8 +171,7 @@ def depth_groups(light: FrameLight, view: FrameImages) -> dict[str, shadow.Metri
     """The frame's values of the group about depth, over pixels whose centre shows an object; None without truth."""
     if light.truth is None:
         return {"depth": None}
-    true = light.truth.depth
-    return {"depth": depth_metrics(light.depth, true, view.valid & (light.truth.object_id > 0) & (true > 0))}
+    return {"depth": depth_metrics(light.depth, light.truth.depth, view.valid & (light.truth.object_id > 0))}
 
 
 def tally_grazing(light: FrameLight, view: FrameImages) -> Array | None:

@@ -104,10 +104,14 @@ DEPTH = (
     Metric(
         "mae", "Depth MAE", "m", LOWER, 4,
         "Mean absolute error of the depth along the optical axis, where the run has one.",
-        "the run has no depth there",
+        "no pixel of an object has a predicted depth",
     ),
-    Metric("rmse", "Depth RMSE", "m", LOWER, 4, "Root mean squared error of the same.", "the run has no depth there"),
-    Metric("missing", "Missing", "", LOWER, 4, "Share of the object's pixels whose predicted alpha is below one half."),
+    Metric(
+        "rmse", "Depth RMSE", "m", LOWER, 4,
+        "Root mean squared error of the same.",
+        "no pixel of an object has a predicted depth",
+    ),
+    Metric("missing", "Missing", "", LOWER, 4, "Share of the object's pixels without depth: alpha is below one half."),
 )  # fmt: skip
 
 MATERIAL = (

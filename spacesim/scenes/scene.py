@@ -265,8 +265,9 @@ def _mitsuba_mesh(name: str, surfaces: Sequence[_Surface], units: Units, bsdf: m
 
 
 def _joined(rows: Sequence[Array | None]) -> Array | None:
-    """Those of all surfaces, None where they have none."""
+    """Those of all surfaces, None where none has any: alike surfaces have all or none."""
     some = [each for each in rows if each is not None]
+    assert len(some) in (0, len(rows)), "surfaces of one mesh are alike"
     return np.concatenate(some) if some else None
 
 

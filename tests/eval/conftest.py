@@ -61,6 +61,7 @@ def truth_layers(inside):
     shadow = np.where(visibility > 0, SHADOW_LIT, SHADOW_SELF_CAST) * inside
     planes = {name: inside.astype(np.float32) for name in Truth.__dataclass_fields__}
     vectors = {name: np.dstack([planes[name]] * 3) for name in ("radiance", "normal", "albedo")}
+    planes["distance"] *= 2  # not what depth is compared with
     return planes | vectors | {"sun_visibility": visibility, "shadow": shadow.astype(np.float32)}
 
 
@@ -71,6 +72,7 @@ class FakeRun:
     dataset: Dataset
     change: object = staticmethod(lambda rgb: rgb)
     visibility: object = None
+    depth: object = 1.0
     path: Path = Path("runs/fake")
     gaussian_count: int = 123
     model_bytes: int = 45678
@@ -96,7 +98,7 @@ class FakeRun:
         frame = next(frame for frame in self.dataset.test if frame.camera is camera)
         rgb = load_image(self.dataset, frame).over(np.zeros(3))
         alpha = np.ones(rgb.shape[:2], np.float32)
-        return Prediction(rgb=self.change(rgb), alpha=alpha, depth=alpha, visibility=self.visibility)
+        return Prediction(rgb=self.change(rgb), alpha=alpha, depth=alpha * self.depth, visibility=self.visibility)
 
 
 @dataclass

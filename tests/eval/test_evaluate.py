@@ -441,6 +441,7 @@ def test_ignored_pixels_count_in_no_group(make_run, dataset, tmp_path):
         run = make_run(
             lambda rgb, ignored=ignored: np.where(rows[..., None] < 25, 0.8 * rgb, ignored).astype(np.float32),
             visibility=np.where(rows < 25, rows / 25, ignored),
+            depth=np.where(rows < 25, 1.25, 5 * ignored),
         )
         metrics = evaluate(run, masked, tmp_path / "eval", EvaluateConfig(fit_gain=True))
         found.append({name: metrics[name] for name in (*GROUPS, "by_grazing_angle", "frames")})

@@ -34,7 +34,7 @@ def pair(dataset):
         layers = read_exr(path)
         second = (np.arange(layers["alpha"].shape[1]) >= CUT) & (index < 3)
         ids = np.where(layers["alpha"] > 0, 1 + second, 0).astype(np.float32)
-        write_exr(path, layers | {"object_id": ids})
+        write_exr(path, layers | {"object_id": ids, "depth": layers["depth"] * (1 + 2 * second).astype(np.float32)})
     objects = [{"id": 1, "name": "ball"}, {"id": 2, "name": "ball"}]
     return replace(dataset, scene={**dataset.scene, "objects": objects})
 
@@ -97,6 +97,7 @@ def test_values_are_those_of_each_objects_pixels(make_run, pair, tmp_path):
     first, second = (one["shadow_mask"]["error_rate"]["mean"] for one in metrics["objects"])
     assert first > 0  # columns 20 and 21 are lit, and predicted dark
     assert second == 0
+    assert [one["depth"]["mae"]["mean"] for one in metrics["objects"]] == [0, 2]
     assert any("ball 2 is in 3 of 4 frames" in note for note in metrics["notes"])
 
 
@@ -129,7 +130,7 @@ def test_the_report_has_both_tables_of_each_object(make_run, pair, tmp_path):
     write_report([tmp_path / "good", tmp_path / "bad"], tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text()
     assert "Object by object" in text
-    for caption in ("ball 1: image", "ball 2: image", "ball 1: shadow by luminance", "ball 2: shadow by luminance"):
+    for caption in ("ball 1: image", "ball 2: image", "ball 1: shadow by luminance", "ball 2: depth"):
         assert caption in text
     assert "ball 1: shadow by predicted visibility" not in text  # these runs predict none
     write_report([tmp_path / "good"], tmp_path / "one.html")

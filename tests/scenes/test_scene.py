@@ -101,7 +101,11 @@ def test_parts_that_look_alike_are_one_mesh_and_keep_their_numbers():
     assert len(shapes) < len(parts)
     faces = np.concatenate([loaded.parts_of[shape.id()] for shape in shapes])
     assert [np.sum(faces == i + 1) for i in range(12)] == [len(part.mesh.faces) for part in parts]
-    assert all(len(loaded.parts_of[shape.id()]) == shape.face_count() for shape in shapes)
+    for shape in shapes:
+        of_faces = loaded.parts_of[shape.id()]
+        assert len(of_faces) == shape.face_count()
+        assert len({(number % 2, number % 3 == 2) for number in of_faces.tolist()}) == 1  # a paint; open or not
+        assert {number % 4 == 3 for number in of_faces.tolist()} == {shape.has_vertex_normals()}
 
     camera = Camera.from_fov(look_at(np.array([20.0, 0, 0]), np.zeros(3)), 240, 16, 40.0)
     truth = Renderer(scene, spp=1).render(camera, Sun(np.array([1.0, 0, 0])), (0,))

@@ -115,9 +115,10 @@ def summary_cell(run: Evaluation, group: str, metric: Metric, suns: str = "") ->
 def _cell(value: JsonDict | None, metric: Metric) -> Cell:
     if value is None:
         return None, _NONE, ""
-    mean, spread = f"{value['mean']:.{metric.digits}f}", f"± {value['std']:.{metric.digits}f}"
+    digits = ".3g" if metric.unit == "m" else f".{metric.digits}f"  # lengths: of a millimetre or of an asteroid
+    mean, spread = f"{value['mean']:{digits}}", f"± {value['std']:{digits}}"
     if "pooled" in value:  # a frame of few such pixels counts little
-        return value["pooled"], f"{value['pooled']:.{metric.digits}f}", f"mean of frames {mean}<br>{spread}"
+        return value["pooled"], f"{value['pooled']:{digits}}", f"mean of frames {mean}<br>{spread}"
     return value["mean"], mean, spread
 
 

@@ -1,5 +1,6 @@
 """Errors of depth: by hand, and through an evaluation."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +28,7 @@ def test_what_is_nowhere_has_no_error():
 
 @pytest.fixture
 def shifted(make_run, dataset):
-    """A run that is half a metre too near in the fourth frame and sees nothing of the third."""
+    """A run that is half a metre too near in the fourth frame, and sees nothing, or infinitely far, in the third."""
     run = make_run()
     predict = run.predict
 
@@ -35,7 +36,9 @@ def shifted(make_run, dataset):
         index = next(i for i, frame in enumerate(dataset.test) if frame.camera is camera)
         prediction = predict(camera, sun, exposure)
         depth = prediction.depth - 0.5 * (index == 3)
-        return replace(prediction, depth=depth, alpha=prediction.alpha * (index != 2))
+        if index == 2:
+            depth[:, :20], prediction.alpha[:, 20:] = np.inf, 0
+        return replace(prediction, depth=depth)
 
     run.predict = shifted_predict
     return run
@@ -47,19 +50,29 @@ def test_frames_say_their_depth_and_the_report_shows_it(shifted, dataset, tmp_pa
     assert [frame["depth"]["missing"] for frame in metrics["frames"]] == [0, 0, 1, 0]
     assert metrics["depth"]["mae"] == pytest.approx({"mean": 1 / 6, "std": np.std([0, 0.5, 0]), "count": 3})
     assert metrics["depth"]["missing"]["mean"] == 0.25
-    note = "Depth MAE over the object's pixels is null in 1 of 4 frames: the run has no depth there"
+    note = "Depth MAE over the object's pixels is null in 1 of 4 frames: no pixel of an object has a predicted depth"
     assert any(sentence.startswith(note) for sentence in metrics["notes"])
     print_headline(metrics)
-    assert "depth: mean error 0.1667 m, missing 0.2500" in capsys.readouterr().out
+    assert "depth: mean error 0.167 m, missing 0.2500 of the pixels" in capsys.readouterr().out
     write_report([tmp_path / "eval"], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "Depth MAE <small>[m]</small> ↓" in page
-    assert "0.1667" in page
+    assert "0.167 <small>± 0.236</small>" in page
     assert "mean error 0.5 m" in page
 
 
-def test_pixels_that_are_ignored_or_show_no_object_count_nowhere(make_run, dataset, tmp_path):
-    """A truth that is a metre off where no object is, in one frame; another frame has none at all."""
+def test_lengths_have_digits_that_count(shifted, dataset, tmp_path):
+    """However small an object is."""
+    evaluate(shifted, dataset, tmp_path / "eval")
+    metrics = json.loads((tmp_path / "eval/metrics.json").read_text())
+    metrics["depth"]["mae"] = {"mean": 2.345e-5, "std": 1.2e-6, "count": 3}
+    (tmp_path / "eval/metrics.json").write_text(json.dumps(metrics))
+    write_report([tmp_path / "eval"], tmp_path / "report.html")
+    assert "2.35e-05 <small>± 1.2e-06</small>" in (tmp_path / "report.html").read_text()
+
+
+def test_pixels_that_show_no_object_count_nowhere(make_run, dataset, tmp_path):
+    """A truth that is a metre off where no object is, in one frame; others have none at all."""
     path = dataset.root / dataset.test[0].gt_path
     layers = read_exr(path)
     ids, depth = layers["object_id"].copy(), layers["depth"].copy()
