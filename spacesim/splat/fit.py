@@ -90,9 +90,9 @@ def estimate_sun(
 
     run, image: as for `refine_pose`
     camera: of the picture, with its size and intrinsics (no distortion);  mask: [H, W], where not 0 the pixel counts
-    Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. All
-    directions are compared, shadows included, on a picture of 128 pixels; the picture's exposure is taken for that of
-    the training pictures. Shadows are cast for the first picture of a run, and kept as long as the run, up to 1 GiB.
+    Pixels count where the picture's alpha is at least one half, or the model's where the picture has none. Directions
+    all over the sphere are compared, shadows included, on a picture of 128 pixels; the picture's exposure is taken for
+    that of the training pictures. Shadows that are cast for a picture are kept as long as the run, up to 1 GiB.
     Raises InputError where the run knows no Sun, for no such picture, and where none counts.
     """
     run = check_gaussians(run)
