@@ -24,6 +24,8 @@ def write_picture(prediction: Prediction, kind: str, path: Path) -> None:
     plane = getattr(prediction, "visibility" if kind == "shadow" else kind)
     if plane is None:
         raise InputError("kind: expected another than shadow, of a run whose method predicts none, found shadow")
+    if kind == "shadow":
+        plane = np.clip(plane, 0, 1)  # a sum of weights over their sum is rounded
     if path.suffix.lower() == ".exr":
         shown = prediction.linear if kind == "rgb" else None
         layers = {kind: plane} if shown is None else {"linear": shown}
