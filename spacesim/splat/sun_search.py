@@ -48,7 +48,7 @@ AMBIENT = 0.02  #: light that comes from everywhere, as a share of the Sun's
 #: shadows, more where no picture is taken against the Sun
 MEAN_COSINES = 0.14, 0.2, 0.28, 0.4, 0.56
 ALTERNATIONS = 2  #: of Suns and albedo
-KEPT_BYTES = 2**30  #: that the light of the whole lattice may take to be kept from one picture to the next
+KEPT_BYTES = 2**30  #: that light of the lattice's Suns may take to be kept from one picture to the next
 #: which Suns of the lattice are looked at first, all over the sphere: every second. Of 180 pictures and halves of them
 #: 179 had the best of all 300 Suns so, of 160, and one another that is as good
 FIRST = 2
@@ -201,7 +201,7 @@ class SunFinder:
         light = None if number is None else self._sunlight.get(number)
         if light is None:
             light = self.light.sunlight(self.gaussians, direction)
-            if number is not None and SPHERE * light.bytes <= KEPT_BYTES:
+            if number is not None and (len(self._sunlight) + 1) * light.bytes <= KEPT_BYTES:
                 self._sunlight[number] = light
         return self.light.shade_picture(self.gaussians, camera, direction, sunlight=light)[0]
 
