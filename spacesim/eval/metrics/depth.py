@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from spacesim.eval.metrics.image import Mask
+from spacesim.eval.metrics.image import Mask, mae, rmse
 from spacesim.eval.metrics.shadow import Metrics
 
 
@@ -12,9 +12,6 @@ def depth_metrics(prediction: np.ndarray, truth: np.ndarray, mask: Mask) -> Metr
     mae, rmse: mean absolute and root mean squared error, metres, over those that have a predicted one (Eigen et al.
     2014, without a scale); missing: share of those that have none. None over no pixel.
     """
-    if not mask.any():
-        return dict.fromkeys(("mae", "rmse", "missing"))
     found = mask & (prediction > 0)
-    error = prediction[found].astype(np.float64) - truth[found]
-    mae, rmse = (float(np.abs(error).mean()), float(np.sqrt((error**2).mean()))) if found.any() else (None, None)
-    return {"mae": mae, "rmse": rmse, "missing": 1 - float(found.sum() / mask.sum())}
+    missing = 1 - float(found.sum() / mask.sum()) if mask.any() else None
+    return {"mae": mae(prediction, truth, found), "rmse": rmse(prediction, truth, found), "missing": missing}
