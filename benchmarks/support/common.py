@@ -19,6 +19,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import BackendError
+from spacesim.backend.launch import take_times
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import fibonacci_sphere, look_at
@@ -261,13 +262,14 @@ def kernels_in_turn(works: Mapping[str, Work], repeats: int = 7) -> dict[str, Ke
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         for _ in range(repeats):
             for name, work in works.items():
+                take_times()
                 dr.sync_thread()
                 dr.kernel_history_clear()
                 work()
                 dr.sync_thread()
-                history = dr.kernel_history()
-                launches[name] = len(history)
-                sums[name].append(sum(entry["execution_time"] for entry in history))
+                times = [entry["execution_time"] for entry in dr.kernel_history()] + take_times()
+                launches[name] = len(times)
+                sums[name].append(sum(times))
     return {name: Kernels(launches[name], float(np.median(sums[name])), min(sums[name])) for name in works}
 
 

@@ -153,19 +153,28 @@ _slots: list[HostSlot] = []  # of `SLOT` bytes, free; taken and given back witho
 
 
 @cache
-def copy_functions() -> dict[str, Any] | None:
-    """Of Dr.Jit's library, by the names of `_FUNCTIONS`; None where one is missing."""
+def dr_library() -> ctypes.CDLL | None:
+    """Dr.Jit's core, as it is loaded; None where no library has one of its names."""
     folder = Path(str(load_drjit().__file__)).parent
     path = next((folder / name for name in _LIBRARIES if (folder / name).exists()), None)
-    if path is None or not hasattr(importlib.import_module(f"drjit.{select()}"), "Event"):
+    try:
+        return ctypes.CDLL(str(path)) if path else None
+    except OSError:
+        return None
+
+
+@cache
+def copy_functions() -> dict[str, Any] | None:
+    """Of Dr.Jit's library, by the names of `_FUNCTIONS`; None where one is missing."""
+    library = dr_library()
+    if library is None or not hasattr(importlib.import_module(f"drjit.{select()}"), "Event"):
         return None
     functions: dict[str, Any] = {}
     wanted = _FUNCTIONS | (_FUNCTIONS_OF_CUDA if select() == "cuda" else {})
     try:
-        library = ctypes.CDLL(str(path))  # the one that is loaded
         for name, (symbol, result, arguments) in wanted.items():
             functions[name] = library[symbol]
             functions[name].restype, functions[name].argtypes = result, arguments
-    except (OSError, AttributeError):
+    except AttributeError:
         return None
     return functions

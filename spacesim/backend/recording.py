@@ -107,7 +107,7 @@ class Recorded(Generic[P, R]):
         self._has_gradients, self._flag, self._scope = dr.grad_enabled, dr.flag, dr.JitFlag.FreezingScope
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
-        with _one_at_a_time:
+        with one_at_a_time:
             return self._call(arguments, named)
 
     def _call(self, arguments: tuple[Any, ...], named: dict[str, Any]) -> R:
@@ -155,7 +155,7 @@ class Recorded(Generic[P, R]):
         return self._names[structure, flat[1]], flat[0]
 
 
-_one_at_a_time = threading.RLock()
+one_at_a_time = threading.RLock()  #: held by whoever records, replays, or launches kernels in between
 _recordings = 0  # that were made
 
 

@@ -22,12 +22,21 @@ class Joined:
         """Where each array begins."""
         return [first for first, _ in self._parts]
 
-    def load(self, arrays: Sequence[Float], place: UInt32 | None = None, row: UInt32 | int = 0) -> Float:
-        """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`."""
+    def load(
+        self,
+        arrays: Sequence[Float],
+        place: UInt32 | None = None,
+        row: UInt32 | int = 0,
+        has_row: Sequence[Bool | bool] | None = None,
+    ) -> Float:
+        """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`.
+        has_row: whether each array has it, else 0"""
         place = self._all() if place is None else place
         values = ad.Float(0)
-        for array, (first, size) in zip(arrays, self._parts, strict=True):
-            values += dr.gather(ad.Float, array, row * size + (place - first), is_within(place, first, size))
+        is_there = [True] * len(arrays) if has_row is None else has_row
+        for array, (first, size), active in zip(arrays, self._parts, is_there, strict=True):
+            inside = is_within(place, first, size) & active
+            values += dr.gather(ad.Float, array, row * size + (place - first), inside)
         return values
 
     def repeat(self, numbers: Sequence[Float]) -> Float:

@@ -38,18 +38,25 @@ def forward(
     shared: Float,
     first_layer: PartialLayer | None = None,
     input_layer: InputLayer | None = None,
+    hidden: MlpTape | None = None,
 ) -> tuple[list[Float], MlpTape]:
     """(outputs, [N] each, the tape that `backward` wants): ReLU between layers, nothing after the last.
 
     weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere, m a
     multiple of 8, on CUDA of 128;
     shared: Float [shared];  first_layer: where there is some, items are the other inputs alone, and the tape is of no
-    use;  input_layer: of the tape of other items with the same weights, and what they share
+    use;  input_layer: of the tape of other items with the same weights, and what they share;  hidden: what hidden
+    layers say of these items, where they have been computed
     """
+    if hidden is not None:
+        tape, input_layer = [*hidden.values], hidden.input_layer
+    else:
+        tape = [items]
     if input_layer is None:
-        input_layer = _input_layer(shape, weights, shared, first_layer.inputs if first_layer else 0)
-    tape, by_warps = [items], select() == "cuda" and first_layer is None
-    for i, (rows, columns) in enumerate(shape.sizes):
+        input_layer = make_input_layer(shape, weights, shared, first_layer.inputs if first_layer else 0)
+    by_warps = select() == "cuda" and first_layer is None
+    for i in range(len(tape) - 1, shape.layers):
+        rows, columns = shape.sizes[i]
         matrix, bias = weights[1 + 2 * i : 3 + 2 * i]
         is_last = i == shape.layers - 1
         if i == 0:
@@ -88,7 +95,24 @@ def backward_together(ways: list[WayBack]) -> list[tuple[list[Float], TensorXf]]
     matrices, _, m = ways[0].grad_output.shape
     sums = warps.WarpSums(matrices, m, sum(warps.rows_summed(way.shape) for way in ways))
     parts, grad_items = zip(*(warps.backward(way, sums) for way in ways), strict=True)
-    return list(zip(warps.totals(ways, list(parts), sums), grad_items, strict=True))
+    return list(zip(warps.totals(ways, list(parts), [sums.of_matrices()]), grad_items, strict=True))
+
+
+def backward_with_hidden(
+    way: WayBack, hidden: warps.HiddenGradients, others: list[WayBack]
+) -> list[tuple[list[Float], TensorXf]]:
+    """`backward_together` of a network whose hidden layers were gone through elsewhere, and others, on CUDA."""
+    matrices, _, m = way.grad_output.shape
+    rows = warps.rows_summed(way.shape, hidden=True) + sum(warps.rows_summed(other.shape) for other in others)
+    sums = warps.WarpSums(matrices, m, rows)
+    parts = [warps.parts_of_hidden(way, hidden, sums, 1)]
+    grad_items = [hidden.grad_items]
+    for other in others:
+        of_other, by_items = warps.backward(other, sums)
+        parts.append(of_other)
+        grad_items.append(by_items)
+    arrays = [sums.of_matrices(), hidden.last]
+    return list(zip(warps.totals([way, *others], parts, arrays), grad_items, strict=True))
 
 
 def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:
@@ -114,7 +138,7 @@ def shared_gradient(shape: MlpShape, weights: list[Float], gradients: list[Float
     return by_shared.array
 
 
-def _input_layer(shape: MlpShape, weights: list[Float], shared: Float, first: int) -> InputLayer:
+def make_input_layer(shape: MlpShape, weights: list[Float], shared: Float, first: int = 0) -> InputLayer:
     """Without the first `first` inputs, in one kernel."""
     rows, stored = shape.sizes[0]
     count, columns = stored - first, round_up_rows(stored - first)

@@ -23,11 +23,11 @@ from spacesim.data.geometry import Array
 from spacesim.learning.networks import network
 from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
-from spacesim.splat.light import shading as kernels
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
-from spacesim.splat.light.shading import ShadingTape, split_weights
-from spacesim.splat.light.shading_inputs import ShadingInputs
+from spacesim.splat.light.shading import backward, forward
+from spacesim.splat.light.shading.forward import ShadingTape, split_weights
+from spacesim.splat.light.shading.inputs import ShadingInputs
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
 from spacesim.splat.light.shadow.light_camera import SUNS, light_rows
 from spacesim.splat.light.sunlight import SunEncoding, Sunlight
@@ -156,7 +156,7 @@ class LightModel:
         terms = self._with_embedding(self.encode_sun(sun, earth), embedding)
         inputs = self._inputs(gaussians, camera, terms, shadows, self.surroundings(gaussians))
         batch = batch or PaddedBatch.of(gaussians.count)
-        colors, visibility, tape = kernels.shade(self.config, self.weights, inputs, batch)
+        colors, visibility, tape = forward.shade(self.config, self.weights, inputs, batch)
         return Shading(colors, visibility[0] if visibility else None, inputs, batch, tape, picture)
 
     def surroundings(self, gaussians: Gaussians) -> Surroundings | None:
@@ -245,7 +245,7 @@ class LightModel:
             return None
         inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows, None)
         batch = PaddedBatch.of(gaussians.count, still=True)
-        return kernels.refined_visibility(self.config, self.weights, inputs, batch)
+        return forward.refined_visibility(self.config, self.weights, inputs, batch)
 
     def arriving(
         self,
@@ -263,7 +263,7 @@ class LightModel:
         inputs = self._inputs(gaussians, None, terms, None, self.surroundings(gaussians))
         batch = PaddedBatch.of(gaussians.count, still=True)
         shares = [] if visibility is None else [visibility]
-        return Sunlight(visibility, *kernels.scatter_sunlight(self.config, self.weights, inputs, batch, shares))
+        return Sunlight(visibility, *forward.scatter_sunlight(self.config, self.weights, inputs, batch, shares))
 
     def shade_picture(
         self,
@@ -302,7 +302,7 @@ class LightModel:
         around = self.surroundings(gaussians) if light.emitted else None  # what is not read is not traced
         inputs = self._inputs(gaussians, of_any_size, terms, None, around)
         of_field, _ = split_weights(self.config, self.weights)
-        shown = kernels.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
+        shown = forward.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
         return shown[:3], None if light.visibility is None else shown[3]
 
     def adjoint(
@@ -311,7 +311,7 @@ class LightModel:
         """From the gradients of the dimmed colours (3 arrays [N]) and, where visibility is seen on its own, of the
         visibility [N]. by_sun: also the gradient of the Sun's direction"""
         grad_visibilities = [] if grad_visibility is None else [grad_visibility]
-        grad_features, grad_weights, by_encoding, grad_sun = kernels.adjoint(
+        grad_features, grad_weights, by_encoding, grad_sun = backward.adjoint(
             self.config,
             self.weights,
             shading.inputs,
@@ -412,7 +412,7 @@ class LightModel:
         if cache is None:
             field = self.config.field
             packed = cooperative.pack(field.shape, of_field) if is_cooperative else None
-            first_layer = None if is_cooperative else kernels.first_layer_of_features(field, of_field, features, batch)
+            first_layer = None if is_cooperative else forward.first_layer_of_features(field, of_field, features, batch)
             cache = _PictureCache(first_layer, packed, self._mean_embedding())
             self._of_pictures.keep(cache, read)
         return cache

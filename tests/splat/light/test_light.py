@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from splats import light_of, met_along, srgb_of
 
-from spacesim.backend import ad
+from spacesim.backend import ad, select
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
@@ -18,6 +18,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import read_points, write_points
+from spacesim.learning.networks import tensor_cores
 from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.export.bake import bake
 from spacesim.splat.light import bounce
@@ -339,6 +340,39 @@ def with_scattered(
     return brightened(light, color, reflected), given
 
 
+@pytest.fixture(params=["all at once", "hidden layers in between"])
+def _ways(request, monkeypatch) -> None:
+    """As networks of 128 units and more are computed on CUDA; on a CPU other products stand for those of its tensor
+    cores."""
+    if request.param == "all at once":
+        return
+    monkeypatch.setattr(tensor_cores, "WIDE", 1)
+    if select() == "llvm":
+        monkeypatch.setattr(tensor_cores, "is_usable", lambda: True)
+        monkeypatch.setattr(tensor_cores, "select", lambda: "cuda")
+        monkeypatch.setattr(tensor_cores, "_launch", launched)
+
+
+def launched(kind, factors, shape, sizes, beside=None):
+    """In place of `tensor_cores._launch`."""
+    rows, columns, depth, batch = sizes[:4]
+    if kind == "outer":
+        first, second = (numbers(factor).reshape(batch, -1, depth) for factor in factors)
+        parts = np.array_split(np.einsum("bmk,bnk->bmn", first, second), sizes[4])
+        result = np.stack([part.sum(axis=0) for part in parts])
+    else:
+        matrix, columns_of = numbers(factors[0]), numbers(factors[1]).reshape(batch, depth, columns)
+        matrix = matrix.reshape(depth, rows).T if kind == "back" else matrix.reshape(rows, depth)
+        result = matrix @ columns_of
+        if kind == "hidden":
+            result = np.maximum(result + numbers(beside)[:, None], 0)
+        elif beside is not None:
+            result = np.where(numbers(beside).reshape(shape) > 0, result, 0)
+    assert result.shape == shape
+    return ad.TensorXf(upload(result.ravel()), shape)
+
+
+@pytest.mark.usefixtures("_ways")
 @pytest.mark.parametrize(
     ("name", "earth"),
     [
@@ -406,6 +440,7 @@ def chosen(indices: np.ndarray, count: int) -> Chosen:
     return Chosen(dr.opaque(ad.UInt32, len(indices)), upload(padded, ad.UInt32), upload(places, ad.UInt32))
 
 
+@pytest.mark.usefixtures("_ways")
 @pytest.mark.parametrize("name", CONFIGS)
 def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
     light, rng = model(name), np.random.default_rng(2)

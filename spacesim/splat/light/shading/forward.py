@@ -1,0 +1,218 @@
+"""Colours and visibility of Gaussians, in training and for pictures."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+
+from spacesim.backend import ad, recorded
+from spacesim.backend.arrays import Float, TensorXf
+from spacesim.learning.networks import mlp, network, tensor_cores
+from spacesim.learning.networks.network import round_up_rows
+from spacesim.splat.light import cooperative
+from spacesim.splat.light.bounce import received_on_sides
+from spacesim.splat.light.config import LightConfig
+from spacesim.splat.light.field import FieldConfig, field_color, field_items, field_views, is_back_side_seen, sun_facing
+from spacesim.splat.light.padded_batch import PaddedBatch
+from spacesim.splat.light.shading.inputs import ShadingInputs
+from spacesim.splat.light.shading.scattering import (
+    Shares,
+    add_scattered,
+    emitted_light,
+    received_light,
+    scattered_light,
+    scatterers_of,
+    shares_of,
+)
+from spacesim.splat.light.shadow.refine import refine_occlusion
+from spacesim.splat.light.sunlight import SunEncoding, Sunlight
+from spacesim.splat.raster.seen import Chosen
+
+
+@dataclass
+class ShadingTape:
+    """What the adjoint needs of the forward pass."""
+
+    field: network.MlpTape  #: of the appearance field
+    refine: network.MlpTape | None  #: of the shadow refinement network, if there is one
+    colors: list[Float]  #: 3 arrays [M] before they are dimmed
+    occlusion: list[Float]  #: the refined one [M] in a list, or nothing
+    faces: list[Float]  #: of `sun_facing`, or nothing
+    scattered: list[Float]  #: of `scattered_light`, [M] each, or nothing
+
+
+def shade(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+) -> tuple[list[Float], list[Float], ShadingTape]:
+    """(dimmed colours, [visibility] or [], tape)."""
+    shape, of_field = config.field.shape, split_weights(config, weights)[0]
+    if not tensor_cores.takes(shape, batch.capacity) or dr.grad_enabled(inputs.features, weights):
+        return _shade(config, weights, inputs, batch, None)
+    items, first = _first_of_field(config, of_field, inputs, batch)
+    hidden = tensor_cores.hidden_layers(shape, of_field, items, first)
+    return _shade(config, weights, inputs, batch, hidden)
+
+
+@recorded
+def _first_of_field(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+) -> tuple[TensorXf, network.InputLayer]:
+    """(items, first layer) of the field. weights: of the field"""
+    items = field_items(config.field, inputs.features, field_views(config.field, inputs.of_field(), batch), batch)
+    return items, mlp.make_input_layer(config.field.shape, weights, inputs.sun.field_encoding)
+
+
+@recorded
+def _shade(
+    config: LightConfig,
+    weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    hidden: network.MlpTape | None,
+) -> tuple[list[Float], list[Float], ShadingTape]:
+    """`shade`. hidden: of the field's hidden layers, where they have been computed"""
+    field_weights, refine_weights = split_weights(config, weights)
+    field_inputs = inputs.of_field()
+    views = field_views(config.field, field_inputs, batch)
+    of_refinement = _refine_items(config, inputs, batch)  # written in one kernel with the field's
+    items = hidden.values[0] if hidden else field_items(config.field, inputs.features, views, batch)
+    encoding = inputs.sun.field_encoding
+    output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, hidden=hidden)
+    colors = [field_color(config.decoding, value) for value in output]
+    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch, of_refinement)
+    faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
+    visibility = [1 - value for value in occlusion]
+    outputs = _dimmed(inputs.sun, colors, visibility, faces)
+    dr.eval(outputs, colors, occlusion, visibility, faces)
+    shares = _emitters_shares(config, refine_weights, inputs, batch, visibility)
+    emitted = emitted_light(config, field_weights, inputs, shares, batch, field_tape.input_layer)
+    light = received_light(config, inputs, emitted, batch, diffuse=True, mirrors=config.mirrors)
+    scattered = scattered_light(config, inputs, light[:3], light[3:], batch)
+    if scattered:
+        outputs = add_scattered(config, inputs, outputs, scattered, batch)
+        dr.eval(outputs, scattered)
+    outputs = batch.unpad(outputs, inputs.means.x)
+    return outputs[:3], outputs[3:], ShadingTape(field_tape, refine_tape, colors, occlusion, faces, scattered)
+
+
+@recorded
+def shade_picture(
+    config: LightConfig,
+    field_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    first_layer: network.PartialLayer | None,
+    packed: cooperative.PackedNetwork | None,
+    sunlight: Sunlight,
+) -> list[Float]:
+    """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
+    field, field_inputs = config.field, inputs.of_field()
+    views = field_views(field, field_inputs, batch)
+    if packed is None:
+        assert first_layer is not None, "one of the two"
+        items = batch.matrix(views, round_up_rows(len(views)))
+        outputs, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
+    else:
+        rows = batch.block(inputs.features, 0, field.features) + views
+        outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
+    colors = [field_color(config.decoding, value) for value in outputs]
+    faces = sun_facing(field, field_inputs, views, batch)
+    visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
+    shown = _dimmed(inputs.sun, colors, visibility, faces)
+    bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
+    if bounced:
+        over = is_back_side_seen(field, field_inputs, batch)
+        bounced = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
+    mirrored = received_light(config, inputs, sunlight.emitted, batch, diffuse=False, mirrors=True)
+    scattered = scattered_light(config, inputs, bounced, mirrored, batch)
+    if scattered:
+        shown = add_scattered(config, inputs, shown, scattered, batch)
+    dr.eval(shown)
+    return batch.unpad(shown, inputs.means.x)
+
+
+@recorded
+def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
+    """Of the Sun, refined, [N]."""
+    _, refine_weights = split_weights(config, weights)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, batch, _refine_items(config, inputs, batch))
+    visibility = 1 - occlusion[0]
+    dr.eval(visibility)
+    return batch.unpad([visibility], inputs.means.x)[0]
+
+
+@recorded
+def scatter_sunlight(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visibility: list[Float]
+) -> tuple[list[Float], list[Float]]:
+    """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
+    field_weights, _ = split_weights(config, weights)
+    emitted = emitted_light(config, field_weights, inputs, shares_of(inputs, visibility), batch)
+    bounced: list[Float] = []
+    if emitted and inputs.surroundings:
+        scatterers = scatterers_of(config, inputs)
+        bounced = received_on_sides(scatterers, inputs.surroundings, emitted, config.bounce, batch)
+    dr.eval(bounced)
+    return batch.unpad(bounced, inputs.means.x), emitted if config.mirrors else []
+
+
+@recorded
+def first_layer_of_features(
+    field: FieldConfig, weights: list[Float], features: Float, batch: PaddedBatch
+) -> network.PartialLayer:
+    items = batch.matrix(batch.block(features, 0, field.features), round_up_rows(field.features))
+    return mlp.first_layer_part(field.shape, weights, items, field.features)
+
+
+def _dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
+    """Colours [M] dimmed by the Earth and by visibility ([M] in a list, or nothing), then that as it is shown. faces:
+    of `sun_facing`"""
+    if not visibility:
+        return sun.colors_left(colors)[0]
+    dimmed, _ = sun.colors_left([color * visibility[0] for color in colors])
+    return dimmed + sun.left([picture_visibility(visibility[0], faces)])
+
+
+def picture_visibility(visibility: Float, faces: list[Float]) -> Float:
+    """A picture's: what is turned away from the Sun does not see it."""
+    return visibility * faces[0] if faces else visibility
+
+
+def _refine_items(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf | None:
+    """Inputs of the refinement, TensorXf [B, C, m], where there is one."""
+    return inputs.refine_items(config.refine, config.field.stored, batch) if config.refine else None
+
+
+def _refine_occlusion(
+    config: LightConfig,
+    refine_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    items: TensorXf | None,
+) -> tuple[list[Float], network.MlpTape | None]:
+    """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`"""
+    occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
+    if not config.refine:
+        return occlusion, None
+    assert items is not None, "the refinement has inputs"
+    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
+    return [refine_occlusion(config.refine, occlusion[0], logit)], tape
+
+
+def _emitters_shares(
+    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visible: list[Float]
+) -> Shares:
+    """Of the Sun that each emitter sees. visible: of the batch, evaluated, in which emitters may be missing"""
+    if batch.chosen is None or inputs.surroundings is None:
+        return shares_of(inputs, visible)
+    emitters = Chosen(ad.UInt32(config.bounce), inputs.surroundings.emitters, None)
+    columns = PaddedBatch.with_room_for(config.bounce, batch.count, emitters)
+    items = _refine_items(config, inputs, columns)
+    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns, items)
+    dr.eval(occlusion)
+    return lambda k: [1 - dr.gather(ad.Float, value, k) for value in occlusion]
+
+
+def split_weights(config: LightConfig, weights: list[Float]) -> tuple[list[Float], list[Float]]:
+    """Weights of the field, of the refinement."""
+    count = 1 + 2 * config.field.layers
+    return weights[:count], weights[count:]
