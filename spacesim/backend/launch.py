@@ -7,7 +7,7 @@ does Dr.Jit's, so nothing else is needed. No recording takes in such a kernel: i
 import ctypes
 import os
 from collections.abc import Sequence
-from ctypes import POINTER, byref, c_char_p, c_float, c_int, c_uint, c_uint32, c_uint64, c_void_p
+from ctypes import POINTER, addressof, byref, c_char_p, c_float, c_int, c_uint, c_uint32, c_uint64, c_void_p
 from functools import cache
 from typing import Any
 
@@ -22,12 +22,17 @@ _DLTENSOR = b"dltensor"  #: name of a capsule of DLPack, whose first field is th
 class PtxKernel:
     """An entry of PTX text, with parameters: addresses of arrays (u64), then numbers (u32).
 
-    shared: bytes of shared memory of a block;  threads: of a block
+    arrays, numbers: how many;  shared: bytes of shared memory of a block;  threads: of a block
     """
 
-    def __init__(self, text: str, entry: str, shared: int, threads: int) -> None:
+    def __init__(self, text: str, entry: str, arrays: int, numbers: int, shared: int, threads: int) -> None:
         """Raises RuntimeError where the driver does not take it, or cannot be reached."""
         self._driver, self._shared, self._threads = _driver(), shared, threads
+        self._addresses, self._numbers = (c_uint64 * arrays)(), (c_uint32 * numbers)()
+        values = [addressof(self._addresses) + 8 * i for i in range(arrays)]
+        self._parameters = (c_void_p * (arrays + numbers))(
+            *values, *[addressof(self._numbers) + 4 * i for i in range(numbers)]
+        )
         module, self._function = c_void_p(), c_void_p()
         with one_at_a_time, self._driver:
             call = self._driver.call
@@ -37,23 +42,31 @@ class PtxKernel:
 
     def __call__(self, grid: tuple[int, int, int], arrays: Sequence[Any], numbers: Sequence[int]) -> None:
         """Launch it behind what the device was asked for. arrays: of Dr.Jit's, evaluated here where they are not"""
-        dr = load_drjit()
-        with one_at_a_time, self._driver:
-            values = [c_uint64(_address(array)) for array in arrays] + [c_uint32(number) for number in numbers]
-            addresses = (c_void_p * len(values))(*[ctypes.addressof(value) for value in values])
-            timed = self._driver.events() if dr.flag(dr.JitFlag.KernelHistory) else None
-            stream = self._driver.stream
-            if timed:
-                self._driver.call("cuEventRecord", timed[0], stream)
-            self._driver.call(
-                "cuLaunchKernel", self._function, *grid, self._threads, 1, 1, self._shared, stream, addresses, None
+        driver, dr = self._driver, load_drjit()
+        with one_at_a_time, driver:
+            self._addresses[:] = [_address(array) for array in arrays]
+            self._numbers[:] = list(numbers)
+            events = driver.events() if dr.flag(dr.JitFlag.KernelHistory) else ()
+            for event in events[:1]:
+                driver.call("cuEventRecord", event, driver.stream)
+            driver.call(
+                "cuLaunchKernel",
+                self._function,
+                *grid,
+                self._threads,
+                1,
+                1,
+                self._shared,
+                driver.stream,
+                self._parameters,
+                None,
             )
-            if timed:
-                self._driver.call("cuEventRecord", timed[1], stream)
-                _timed.append(timed)
+            for event in events[1:]:
+                driver.call("cuEventRecord", event, driver.stream)
+                _timed.append(events)
 
 
-_timed: list[tuple[c_void_p, c_void_p]] = []  # events before and after launches that were timed
+_timed: list[tuple[c_void_p, ...]] = []  # events before and after launches that were timed
 
 
 def take_times() -> list[float]:
@@ -77,15 +90,11 @@ def take_times() -> list[float]:
 def _address(array: Any) -> int:
     """Of an array's numbers in the device's memory."""
     capsule = array.__dlpack__()
-    tensor = _pointer_of_capsule()(capsule, _DLTENSOR)
-    return c_uint64.from_address(tensor).value
+    return c_uint64.from_address(_pointer(capsule, _DLTENSOR)).value
 
 
-@cache
-def _pointer_of_capsule() -> Any:
-    function = ctypes.pythonapi.PyCapsule_GetPointer
-    function.restype, function.argtypes = c_void_p, [ctypes.py_object, c_char_p]
-    return function
+_pointer = ctypes.pythonapi.PyCapsule_GetPointer
+_pointer.restype, _pointer.argtypes = c_void_p, [ctypes.py_object, c_char_p]
 
 
 _ARGUMENTS: dict[str, list[Any]] = {
@@ -129,7 +138,7 @@ class _Driver:
         if failed:
             raise RuntimeError(f"{name} failed with error {failed} of the CUDA driver")
 
-    def events(self) -> tuple[c_void_p, c_void_p]:
+    def events(self) -> tuple[c_void_p, ...]:
         """Two that know the time."""
         pair = c_void_p(), c_void_p()
         for event in pair:

@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import TypeVar
 
 import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, UInt32
+
+Number = TypeVar("Number", Float, UInt32)
 
 
 class Joined:
@@ -22,26 +25,17 @@ class Joined:
         """Where each array begins."""
         return [first for first, _ in self._parts]
 
-    def load(
-        self,
-        arrays: Sequence[Float],
-        place: UInt32 | None = None,
-        row: UInt32 | int = 0,
-        has_row: Sequence[Bool | bool] | None = None,
-    ) -> Float:
-        """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`.
-        has_row: whether each array has it, else 0"""
+    def load(self, arrays: Sequence[Float], place: UInt32 | None = None, row: UInt32 | int = 0) -> Float:
+        """Numbers at `place` of the row, all by default, where arrays [rows * size] have several: of number `row`."""
         place = self._all() if place is None else place
         values = ad.Float(0)
-        is_there = [True] * len(arrays) if has_row is None else has_row
-        for array, (first, size), active in zip(arrays, self._parts, is_there, strict=True):
-            inside = is_within(place, first, size) & active
-            values += dr.gather(ad.Float, array, row * size + (place - first), inside)
+        for array, (first, size) in zip(arrays, self._parts, strict=True):
+            values += dr.gather(ad.Float, array, row * size + (place - first), is_within(place, first, size))
         return values
 
-    def repeat(self, numbers: Sequence[Float]) -> Float:
-        """[S]: a number for all of each array."""
-        place, values = self._all(), ad.Float(0)
+    def repeat(self, numbers: Sequence[Number], place: UInt32 | None = None) -> Number:
+        """Of each array's number at `place` of the row, all by default."""
+        place, values = self._all() if place is None else place, type(numbers[0])(0)
         for number, (first, _) in zip(numbers, self._parts, strict=True):
             values = dr.select(place >= first, number, values)
         return values

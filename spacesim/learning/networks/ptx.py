@@ -18,6 +18,7 @@ STAGES = 2  #: of them, so many times: some are on their way
 WARP_ROWS, WARP_COLUMNS = 64, 32  #: of the result, a warp
 THREADS = ROWS // WARP_ROWS * (COLUMNS // WARP_COLUMNS) * 32  #: of a block
 BLOCKS = 2  #: at a time on a multiprocessor, at least
+ADDRESSES, NUMBERS = 4, 5  #: parameters
 FOUR, BYTES = 4, 4  #: numbers that are copied at once; bytes of a number
 ROUND, KEPT = "0x1000", "0xffffe000"  #: half of the last bit that TF32 keeps; the bits that it keeps
 
@@ -86,16 +87,16 @@ class ProductText:
 
     def grid(self, rows: int, columns: int, batch: int, parts: int) -> tuple[int, int, int]:
         """Blocks for M, N, B, G."""
-        across = -(-rows // ROWS)
         if self.kind == "outer":
-            return parts, across, -(-columns // COLUMNS)
-        return batch * CHUNK // COLUMNS, across, 1
+            return -(-rows // ROWS), -(-columns // COLUMNS), parts
+        return -(-rows // ROWS) * batch * (CHUNK // COLUMNS), 1, 1
 
     @cached_property
     def text(self) -> str:
         """For compute capability 8.0 or later."""
         self._write()
-        parameters = [f".param .u64 p{i}" for i in range(4)] + [f".param .u32 p{i}" for i in range(4, 9)]
+        types = ["u64"] * ADDRESSES + ["u32"] * NUMBERS
+        parameters = [f".param .{kind} p{i}" for i, kind in enumerate(types)]
         return "\n".join(
             [
                 ".version 7.1\n.target sm_80\n.address_size 64",
@@ -130,23 +131,24 @@ class ProductText:
         block = [self._make("mov.u32", f"%ctaid.{axis}") for axis in "xyz"]
         self._first, self._second, self._result, self._beside = (
             self._make("cvta.to.global.u64", self._make("ld.param.u64", f"[p{i}]", kind="d"), kind="d")
-            for i in range(4)
+            for i in range(ADDRESSES)
         )
         self._rows, self._columns, self._depth, batch, parts = (
-            self._make("ld.param.u32", f"[p{i}]") for i in range(4, 9)
+            self._make("ld.param.u32", f"[p{i}]") for i in range(ADDRESSES, ADDRESSES + NUMBERS)
         )
         self._shared = self._make("mov.u32", "shared")
-        self._row = self._make("mul.lo.u32", block[1], ROWS)  # first one of the block's
-        self._matrix = self._part = block[0]
+        # blocks that read the same columns run at the same time: those are still in the cache
         if self.kind == "outer":
-            self._column = self._make("mul.lo.u32", block[2], COLUMNS)
+            row, column, self._part = block
             self._split(batch, parts)
         else:
-            blocks_a_matrix = CHUNK // COLUMNS
-            within = self._make("rem.u32", block[0], blocks_a_matrix)
-            self._matrix = self._make("div.u32", block[0], blocks_a_matrix)
-            self._column = self._make("mul.lo.u32", within, COLUMNS)
+            above = self._make("div.u32", self._make("add.u32", self._rows, ROWS - 1), ROWS)
+            row, place = self._make("rem.u32", block[0], above), self._make("div.u32", block[0], above)
+            self._matrix = self._make("div.u32", place, CHUNK // COLUMNS)
+            column = self._make("rem.u32", place, CHUNK // COLUMNS)
             self._length, self._start = self._depth, "0"
+        self._row = self._make("mul.lo.u32", row, ROWS)  # first ones of the block's
+        self._column = self._make("mul.lo.u32", column, COLUMNS)
         self._multiply(self._copies())
 
     def _split(self, batch: str, parts: str) -> None:

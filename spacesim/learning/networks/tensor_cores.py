@@ -3,6 +3,7 @@ Dr.Jit's own products, which use none. Their kernels are launched between record
 
 import logging
 from functools import cache
+from math import prod
 
 import drjit as dr
 import numpy as np
@@ -13,7 +14,7 @@ from spacesim.backend.launch import PtxKernel
 from spacesim.backend.upload import upload
 from spacesim.learning.networks import warps
 from spacesim.learning.networks.network import InputLayer, MlpShape, MlpTape
-from spacesim.learning.networks.ptx import CHUNK, FOUR, THREADS, Kind, ProductText
+from spacesim.learning.networks.ptx import ADDRESSES, CHUNK, FOUR, NUMBERS, THREADS, Kind, ProductText
 
 WIDE = 128  #: units of a hidden layer from which on it pays
 PARTS = 64  #: sums over columns are made in so many parts, to fill the device
@@ -99,7 +100,7 @@ def _launch(
     """The result of `ProductText`, of this shape. sizes: M, N, K, B, G"""
     rows, columns, depth, batch, parts = (*sizes, 1)[:5]
     text, kernel = _kernel(kind, kind == "back" and beside is not None)
-    result = dr.empty(ad.Float, int(np.prod(shape)))
+    result = dr.empty(ad.Float, prod(shape))
     arrays = [*factors, result, factors[0] if beside is None else beside]
     kernel(text.grid(rows, columns, batch, parts), arrays, (rows, columns, depth, batch, parts))
     return ad.TensorXf(result, shape)
@@ -108,7 +109,7 @@ def _launch(
 @cache
 def _kernel(kind: Kind, masked: bool) -> tuple[ProductText, PtxKernel]:
     text = ProductText(kind, masked)
-    return text, PtxKernel(text.text, text.entry, text.shared, THREADS)
+    return text, PtxKernel(text.text, text.entry, ADDRESSES, NUMBERS, text.shared, THREADS)
 
 
 def _largest_error() -> float:

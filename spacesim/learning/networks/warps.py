@@ -163,13 +163,13 @@ def totals(ways: list[WayBack], parts: list[list[Part]], sums: list[Float]) -> l
     ends = {count: dr.opaque(ad.UInt32, count) for count in counts}  # no numbers of a kernel's text
     entry = dr.arange(ad.UInt32, GROUPS * joined.size)
     place, group = entry % joined.size, entry // joined.size
-    end = ends[max(counts)]
+    end = joined.repeat([ends[count] for count in counts], place)
 
     def has_more(k: UInt32, _total: Float) -> Bool:
         return k < end
 
     def add(k: UInt32, total: Float) -> tuple[UInt32, Float]:
-        return k + GROUPS, total + joined.load(arrays, place, k, [k < ends[count] for count in counts])
+        return k + GROUPS, total + joined.load(arrays, place, k)
 
     state = group, dr.zeros(ad.Float, GROUPS * joined.size)
     _, of_groups = dr.while_loop(state, has_more, add, mode="symbolic", label="sum over matrices")

@@ -74,7 +74,7 @@ def test_products_repeat_to_the_bit_and_are_timed_when_that_is_asked_for():
 @pytest.mark.usefixtures("_cuda")
 def test_text_that_the_driver_does_not_take_is_named():
     with pytest.raises(RuntimeError, match="cuModuleLoadData failed"):
-        launch.PtxKernel("no text", "entry", 0, 32)
+        launch.PtxKernel("no text", "entry", 1, 1, 0, 32)
 
 
 def test_wide_networks_of_few_outputs_take_them_where_kernels_can_be_launched(monkeypatch):
