@@ -240,7 +240,8 @@ def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP)
 
 @dataclass(frozen=True)
 class Kernels:
-    """What Dr.Jit's kernel history says of a call: launches, milliseconds on the device (median and least)."""
+    """What Dr.Jit's kernel history and `launch.take_times` say of a call: launches, milliseconds on the device (median
+    and least)."""
 
     launches: int
     milliseconds: float

@@ -15,6 +15,7 @@ from spacesim.backend.readback import dr_library
 from spacesim.backend.recording import one_at_a_time
 from spacesim.backend.selection import load_drjit
 
+MAX_TIMED = 10_000  #: launches whose times are kept, if nobody takes them
 MAX_SHARED = 8  #: CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _DLTENSOR = b"dltensor"  #: name of a capsule of DLPack, whose first field is the address
 
@@ -64,6 +65,8 @@ class PtxKernel:
             for event in events[1:]:
                 driver.call("cuEventRecord", event, driver.stream)
                 _timed.append(events)
+        if len(_timed) > MAX_TIMED:
+            take_times()
 
 
 _timed: list[tuple[c_void_p, ...]] = []  # events before and after launches that were timed

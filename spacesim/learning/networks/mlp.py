@@ -105,14 +105,14 @@ def backward_with_hidden(
     matrices, _, m = way.grad_output.shape
     rows = warps.rows_summed(way.shape, hidden=True) + sum(warps.rows_summed(other.shape) for other in others)
     sums = warps.WarpSums(matrices, m, rows)
-    parts = [warps.parts_of_hidden(way, hidden, sums, 1)]
+    parts = [warps.parts_of_hidden(way, hidden, sums)]
     grad_items = [hidden.grad_items]
     for other in others:
         of_other, by_items = warps.backward(other, sums)
         parts.append(of_other)
         grad_items.append(by_items)
-    arrays = [sums.of_matrices(), hidden.last]
-    return list(zip(warps.totals([way, *others], parts, arrays), grad_items, strict=True))
+    own_and_last = [sums.of_matrices(), hidden.last]
+    return list(zip(warps.totals([way, *others], parts, own_and_last), grad_items, strict=True))
 
 
 def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:

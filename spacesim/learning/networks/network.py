@@ -12,6 +12,7 @@ from spacesim.backend.arrays import Float, TensorXf
 MAX_FEATURES, MAX_WIDTH, MAX_LAYERS = 1024, 4096, 32
 """Of a network: numbers a Gaussian, units of a layer, layers, far above any that pays."""
 ALIGNED = 4  #: rows of matrices are a multiple of it
+CHUNK = 512  #: columns of each matrix of many: 100,000 Gaussians in chunks fill a GPU
 TILE = 64  #: rows of a product that are computed at once
 
 

@@ -16,12 +16,13 @@ PACKET = SIZE["cuda"]
 COLUMNS = PACKET * WARP  #: of a matrix that they sum up, of which there are a multiple
 GROUPS = 8  #: of matrices that are summed up at the same time
 FEW = 4  #: rows of a matrix at which products by tiles are slow
+OWN, LAST = 0, 1  #: `WarpSums`; `LastGradient.sums`
 
 
 class Row(NamedTuple):
-    """Of sums over the columns of each of B matrices, Float [B * rows], of which there may be several."""
+    """Where a gradient's numbers stand in sums over the columns of each of B matrices, Float [B * rows]."""
 
-    sums: int  #: number of the sums
+    which: int  #: of the sums: `OWN`, or `LAST` of a network whose hidden layers are gone through elsewhere
     row: int  #: the first of as many as the gradient has numbers
 
 
@@ -31,16 +32,16 @@ Part = Float | Row
 
 class WarpSums:
     """Sums over the columns of each of B matrices, of any number of rows: the threads of a warp sum up what they
-    compute, in the kernel that does, and one reduction sums up the warps of all rows. number: of `Row`"""
+    compute, in the kernel that does, and one reduction sums up the warps of all rows."""
 
-    def __init__(self, matrices: int, m: int, rows: int, number: int = 0) -> None:
-        self.rows, self.number, self._warps_a_row, self._taken = rows, number, m // COLUMNS, 0
+    def __init__(self, matrices: int, m: int, rows: int) -> None:
+        self.rows, self._warps_a_row, self._taken = rows, m // COLUMNS, 0
         self._warps = dr.zeros(ad.Float, matrices * rows * self._warps_a_row)
 
     def take(self, rows: int) -> Row:
         """The first of so many rows that nothing else adds to."""
         self._taken += rows
-        return Row(self.number, self._taken - rows)
+        return Row(OWN, self._taken - rows)
 
     def add(self, values: Array4f, at: Packets, row: UInt32, active: Bool | bool = True) -> None:
         """What stands `at` to a row of its matrix."""
@@ -140,20 +141,20 @@ def through_last(way: WayBack) -> LastGradient:
     return LastGradient(gradient, sums.of_matrices(), way.input_matrix())
 
 
-def parts_of_hidden(way: WayBack, hidden: HiddenGradients, sums: WarpSums, number: int) -> list[Part]:
-    """As `backward` gives them. number: of `hidden.last` among the sums"""
+def parts_of_hidden(way: WayBack, hidden: HiddenGradients, sums: WarpSums) -> list[Part]:
+    """As `backward` gives them."""
     rows, columns = way.shape.outputs, way.shape.width
     parts: list[Part] = []
     for i, matrix in enumerate(hidden.products):
         is_last = i == len(hidden.products) - 1
-        bias = Row(number, rows * columns + rows) if is_last else sums.of_rows(hidden.gradients[i])
+        bias = Row(LAST, rows * columns + rows) if is_last else sums.of_rows(hidden.gradients[i])
         parts += [matrix, bias]
-    return [*parts, Row(number, 0), Row(number, rows * columns)]
+    return [*parts, Row(LAST, 0), Row(LAST, rows * columns)]
 
 
 def totals(ways: list[WayBack], parts: list[list[Part]], sums: list[Float]) -> list[list[Float]]:
     """Gradients of the weights of each way from those of each matrix or part, all in two kernels. sums: [B * rows]
-    each, by the numbers of `Row`"""
+    each, by `Row.which`"""
     matrices = ways[0].grad_output.shape[0]
     pairs = [(part, _size(way, i)) for way, of_way in zip(ways, parts, strict=True) for i, part in enumerate(of_way)]
     products = [(part, size) for part, size in pairs if not isinstance(part, Row)]
@@ -180,7 +181,7 @@ def totals(ways: list[WayBack], parts: list[list[Part]], sums: list[Float]) -> l
     gradients = []
     for way, of_way in zip(ways, parts, strict=True):
         starts = [
-            joined.starts[part.sums] + part.row if isinstance(part, Row) else next(first_of_product) for part in of_way
+            joined.starts[part.which] + part.row if isinstance(part, Row) else next(first_of_product) for part in of_way
         ]
         gradients.append(_gradients(way, total, place, starts))
     dr.eval(gradients)

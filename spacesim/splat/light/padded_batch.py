@@ -8,10 +8,9 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, TensorXf, UInt32
 from spacesim.backend.upload import held
+from spacesim.learning.networks.network import CHUNK
 from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.seen import Chosen
-
-CHUNK = 512  #: columns of a chunk, of which `round_capacity` is a multiple: 100,000 Gaussians fill a GPU
 
 
 @dataclass

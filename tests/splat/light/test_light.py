@@ -341,7 +341,7 @@ def with_scattered(
 
 
 @pytest.fixture(params=["all at once", "hidden layers in between"])
-def _ways(request, monkeypatch) -> None:
+def _products(request, monkeypatch) -> None:
     """As networks of 128 units and more are computed on CUDA; on a CPU other products stand for those of its tensor
     cores."""
     if request.param == "all at once":
@@ -372,7 +372,7 @@ def launched(kind, factors, shape, sizes, beside=None):
     return ad.TensorXf(upload(result.ravel()), shape)
 
 
-@pytest.mark.usefixtures("_ways")
+@pytest.mark.usefixtures("_products")
 @pytest.mark.parametrize(
     ("name", "earth"),
     [
@@ -431,6 +431,15 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
         assert not gradient[[0, 1, 2, 4]].any(), "of the other pictures"
 
 
+@pytest.mark.usefixtures("_products")
+def test_gradients_of_what_is_shaded_go_through_networks():
+    light, splats = model("relight"), gaussians(37, FIELD.features)
+    dr.enable_grad(splats.means)
+    shading = light.shade(splats, eye(), SUN, picture=3)
+    dr.backward(dr.sum(sum(shading.colors, ad.Float(0))))
+    assert np.abs(numbers(dr.grad(splats.means))).sum() > 1
+
+
 def chosen(indices: np.ndarray, count: int) -> Chosen:
     """In arrays as long as training's."""
     length = round_capacity(count)
@@ -440,7 +449,7 @@ def chosen(indices: np.ndarray, count: int) -> Chosen:
     return Chosen(dr.opaque(ad.UInt32, len(indices)), upload(padded, ad.UInt32), upload(places, ad.UInt32))
 
 
-@pytest.mark.usefixtures("_ways")
+@pytest.mark.usefixtures("_products")
 @pytest.mark.parametrize("name", CONFIGS)
 def test_of_chosen_gaussians_light_and_its_adjoint_are_as_of_all(name):
     light, rng = model(name), np.random.default_rng(2)

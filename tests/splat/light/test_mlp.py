@@ -7,9 +7,9 @@ import pytest
 from spacesim.backend import ad, recorded
 from spacesim.backend.upload import upload
 from spacesim.learning.networks import mlp, network
-from spacesim.learning.networks.network import MlpShape, round_up_rows
+from spacesim.learning.networks.network import CHUNK, MlpShape, round_up_rows
 from spacesim.splat.light import cooperative
-from spacesim.splat.light.padded_batch import CHUNK, PaddedBatch
+from spacesim.splat.light.padded_batch import PaddedBatch
 
 SHAPES = {
     "filled up": MlpShape(5, 3, 2, 12, 3),

@@ -45,9 +45,11 @@ def shade(
 ) -> tuple[list[Float], list[Float], ShadingTape]:
     """(dimmed colours, [visibility] or [], tape)."""
     shape, of_field = config.field.shape, split_weights(config, weights)[0]
-    if not tensor_cores.takes(shape, batch.capacity) or dr.grad_enabled(inputs.features, weights):
+    if not tensor_cores.takes(shape, batch.capacity):
         return _shade(config, weights, inputs, batch, None)
     items, first = _first_of_field(config, of_field, inputs, batch)
+    if dr.grad_enabled(items, first.matrix, first.bias, of_field):  # which a launch would not know of
+        return _shade(config, weights, inputs, batch, None)
     hidden = tensor_cores.hidden_layers(shape, of_field, items, first)
     return _shade(config, weights, inputs, batch, hidden)
 
@@ -73,7 +75,7 @@ def _shade(
     field_weights, refine_weights = split_weights(config, weights)
     field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
-    of_refinement = _refine_items(config, inputs, batch)  # written in one kernel with the field's
+    of_refinement = _refine_items(config, inputs, batch)  # written in one kernel with the field's, if any are
     items = hidden.values[0] if hidden else field_items(config.field, inputs.features, views, batch)
     encoding = inputs.sun.field_encoding
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, hidden=hidden)

@@ -1,17 +1,19 @@
 """Text of kernels that multiply matrices of float32 on tensor cores, exact as in single precision.
 
 A tensor core multiplies numbers of TF32: 11 bits, and the exponent of float32. So a number a is split into two, a = a1
-+ a2 but for its last bits, and a product ab is a1 b1 + a1 b2 + a2 b1 (Ootomo and Yokota 2022). What it adds up it cuts
-off rather than rounds, so it adds up `DEPTH` products, and these sums are added up in float32. A block has a tile of
-`ROWS` x `COLUMNS` of the result; tiles of both factors come `DEPTH` columns and rows at a time to shared memory, while
-the last ones are multiplied. Which thread holds which entries: PTX ISA, "mma.m16n8k8".
++ a2 but for its last bits, and a product ab is a1 b1 + a1 b2 + a2 b1 (Ootomo and Yokota 2022); infinity gives NaN. What
+it adds up it cuts off rather than rounds, so it adds up `DEPTH` products, and these sums are added up in float32.
+
+A block has a tile of `ROWS` x `COLUMNS` of the result; tiles of both factors come `DEPTH` columns and rows at a time to
+shared memory, while the last ones are multiplied. Which thread holds which entries: PTX ISA, "mma.m16n8k8".
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-CHUNK = 512  #: columns of each matrix of a batch
+from spacesim.learning.networks.network import CHUNK
+
 ROWS, COLUMNS = 128, 64  #: of the result, a block
 DEPTH = 32  #: columns of the first factor, rows of the second, that are in shared memory at once
 STAGES = 2  #: of them, so many times: some are on their way
@@ -19,7 +21,7 @@ WARP_ROWS, WARP_COLUMNS = 64, 32  #: of the result, a warp
 THREADS = ROWS // WARP_ROWS * (COLUMNS // WARP_COLUMNS) * 32  #: of a block
 BLOCKS = 2  #: at a time on a multiprocessor, at least
 ADDRESSES, NUMBERS = 4, 5  #: parameters
-FOUR, BYTES = 4, 4  #: numbers that are copied at once; bytes of a number
+COPIED, BYTES = 4, 4  #: numbers that are copied at once; bytes of a number
 ROUND, KEPT = "0x1000", "0xffffe000"  #: half of the last bit that TF32 keeps; the bits that it keeps
 
 Kind = Literal["hidden", "back", "outer"]
@@ -67,7 +69,7 @@ class ProductText:
     back: [B, M, m] = A^T B of A [K, M], B [B, K, m], with `masked` 0 where V [B, M, m] is not above 0
     outer: [G, M, N] = sums of A_b B_b^T over the columns, in G parts, of A [B, M, m], B [B, N, m]
 
-    m = `CHUNK`; K, and of back M, multiples of 4. Parameters: addresses of A, B, the result, v or V; M, N, K, B, G.
+    m = `CHUNK`; M, N and K are multiples of 4. Parameters: addresses of A, B, the result, v or V; M, N, K, B, G.
     Blocks: `grid`.
     """
 
@@ -109,7 +111,7 @@ class ProductText:
             ]
         )
 
-    def _say(self, line: str) -> None:
+    def _emit(self, line: str) -> None:
         self._lines.append(f"{line};")
 
     def _new(self, kind: str = "r") -> str:
@@ -120,7 +122,7 @@ class ProductText:
     def _make(self, operation: str, *operands: object, kind: str = "r") -> str:
         """A new register with what the operation gives."""
         register = self._new(kind)
-        self._say(f"{operation} {', '.join(map(str, (register, *operands)))}")
+        self._emit(f"{operation} {', '.join(map(str, (register, *operands)))}")
         return register
 
     def _zero(self) -> str:
@@ -165,11 +167,11 @@ class ProductText:
     def _copies(self) -> list[_Copy]:
         copies = []
         for number, tile in enumerate(self._tiles):
-            across = (DEPTH if tile.along_k else tile.size) // FOUR
-            for j in range(tile.size * DEPTH // FOUR // THREADS):
+            across = (DEPTH if tile.along_k else tile.size) // COPIED
+            for j in range(tile.size * DEPTH // COPIED // THREADS):
                 index = self._make("add.u32", self._thread, j * THREADS)
                 line, place = self._make("div.u32", index, across), self._make("rem.u32", index, across)
-                place = self._make("mul.lo.u32", place, FOUR)
+                place = self._make("mul.lo.u32", place, COPIED)
                 i, k = (line, place) if tile.along_k else (place, line)
                 target = self._make("mad.lo.u32", line, tile.pitch, place)
                 target = self._make("mad.lo.u32", target, BYTES, self._shared)
@@ -218,8 +220,8 @@ class ProductText:
 
     def _multiply(self, copies: list[_Copy]) -> None:
         tall, wide = WARP_ROWS // 16, WARP_COLUMNS // 8
-        strides, into = self._strides(), self._make("mov.u32", 0)
-        outof, step = self._make("mov.u32", 0), self._make("mov.u32", 0)
+        strides, stage_filled = self._strides(), self._make("mov.u32", 0)
+        stage_read, step = self._make("mov.u32", 0), self._make("mov.u32", 0)
         lane, warp = self._make("and.b32", self._thread, 31), self._make("shr.u32", self._thread, 5)
         group, self._pair = self._make("shr.u32", lane, 2), self._make("and.b32", lane, 3)
         across = COLUMNS // WARP_COLUMNS
@@ -233,50 +235,50 @@ class ProductText:
         total = [[[self._zero() for _ in four] for four in sums] for sums in inner]
         steps = self._make("div.u32", self._make("add.u32", self._length, DEPTH - 1), DEPTH)
         for _ in range(STAGES - 1):
-            self._copy(copies, strides, into)
+            self._copy(copies, strides, stage_filled)
         self._lines.append("NEXT:")
-        self._say(f"cp.async.wait_group {STAGES - 2}")
-        self._say("bar.sync 0")
-        self._copy(copies, strides, into)
-        read = [self._make("add.u32", start, outof) for start in starts]
+        self._emit(f"cp.async.wait_group {STAGES - 2}")
+        self._emit("bar.sync 0")
+        self._copy(copies, strides, stage_filled)
+        read = [self._make("add.u32", start, stage_read) for start in starts]
         for k in range(0, DEPTH, 8):
             self._multiply_eight(read, k, inner)
         for sums, sums_of_step in zip(total, inner, strict=True):
             for four, four_of_step in zip(sums, sums_of_step, strict=True):
                 for one, other in zip(four, four_of_step, strict=True):
-                    self._say(f"add.rn.f32 {one}, {one}, {other}")
-        self._turn(outof)
-        self._say(f"add.u32 {step}, {step}, 1")
+                    self._emit(f"add.rn.f32 {one}, {one}, {other}")
+        self._turn(stage_read)
+        self._emit(f"add.u32 {step}, {step}, 1")
         again = self._make("setp.lt.u32", step, steps, kind="p")
         self._lines.append(f"@{again} bra NEXT;")
-        self._say("cp.async.wait_all")
+        self._emit("cp.async.wait_all")
         self._store(total)
 
-    def _copy(self, copies: list[_Copy], strides: list[str], into: str) -> None:
+    def _copy(self, copies: list[_Copy], strides: list[str], stage_filled: str) -> None:
         """Ask for the next step's tiles, zeros beyond the factors."""
         if self.kind == "outer":
-            self._say(f"add.u32 {self._within}, {self._within}, 1")
+            self._emit(f"add.u32 {self._within}, {self._within}, 1")
             is_last = self._make("setp.eq.u32", self._within, CHUNK // DEPTH, kind="p")
             strides = [
                 self._make("selp.b64", jump, beside, is_last, kind="d")
                 for jump, beside in zip(self._jumps, strides, strict=True)
             ]
-            self._say(f"selp.u32 {self._within}, 0, {self._within}, {is_last}")
+            self._emit(f"selp.u32 {self._within}, 0, {self._within}, {is_last}")
         for one in copies:
             is_there = self._make("setp.lt.u32", one.depth, one.end, kind="p")
-            size = self._make("selp.u32", FOUR * BYTES, 0, is_there)
-            target = self._make("add.u32", one.target, into)
-            self._say(f"cp.async.cg.shared.global [{target}], [{one.source}], {FOUR * BYTES}, {size}")
-            self._say(f"add.u64 {one.source}, {one.source}, {strides[one.tile]}")
-            self._say(f"add.u32 {one.depth}, {one.depth}, {DEPTH}")
-        self._say("cp.async.commit_group")
-        self._turn(into)
+            size = self._make("selp.u32", COPIED * BYTES, 0, is_there)
+            target = self._make("add.u32", one.target, stage_filled)
+            self._emit(f"cp.async.cg.shared.global [{target}], [{one.source}], {COPIED * BYTES}, {size}")
+            self._emit(f"add.u64 {one.source}, {one.source}, {strides[one.tile]}")
+            self._emit(f"add.u32 {one.depth}, {one.depth}, {DEPTH}")
+        self._emit("cp.async.commit_group")
+        self._turn(stage_filled)
 
     def _turn(self, stage: str) -> None:
         """To the next stage, and from the last to the first."""
-        self._say(f"add.u32 {stage}, {stage}, {self._stage}")
+        self._emit(f"add.u32 {stage}, {stage}, {self._stage}")
         is_last = self._make("setp.eq.u32", stage, self.shared, kind="p")
-        self._say(f"selp.u32 {stage}, 0, {stage}, {is_last}")
+        self._emit(f"selp.u32 {stage}, 0, {stage}, {is_last}")
 
     def _fragment_start(self, number: int, lane: str) -> str:
         """Address in the first stage from where a thread reads: of ldmatrix along the sum, of its own entry across."""
@@ -312,7 +314,7 @@ class ProductText:
             self._ldmatrix(numbers, start, tile.at(row, k))
         else:
             for number, (i, below) in zip(numbers, ((0, 0), (8, 0), (0, 4), (8, 4)), strict=True):
-                self._say(f"ld.shared.b32 {number}, [{start}+{tile.at(row + i, k + below)}]")
+                self._emit(f"ld.shared.b32 {number}, [{start}+{tile.at(row + i, k + below)}]")
         return numbers
 
     def _read_second(self, start: str, column: int, k: int) -> list[list[str]]:
@@ -323,21 +325,21 @@ class ProductText:
             self._ldmatrix(numbers, start, tile.at(column, k))
         else:
             for number, (i, below) in zip(numbers, ((0, 0), (0, 4), (8, 0), (8, 4)), strict=True):
-                self._say(f"ld.shared.b32 {number}, [{start}+{tile.at(column + i, k + below)}]")
+                self._emit(f"ld.shared.b32 {number}, [{start}+{tile.at(column + i, k + below)}]")
         return [numbers[:2], numbers[2:]]
 
     def _ldmatrix(self, numbers: list[str], start: str, offset: int) -> None:
-        self._say(f"ldmatrix.sync.aligned.m8n8.x4.shared.b16 {{{', '.join(numbers)}}}, [{start}+{offset}]")
+        self._emit(f"ldmatrix.sync.aligned.m8n8.x4.shared.b16 {{{', '.join(numbers)}}}, [{start}+{offset}]")
 
     def _halves(self, number: str) -> tuple[str, str]:
-        """(what TF32 keeps of a number, rounded, and the rest)."""
+        """(what TF32 keeps of a number, rounded, and of the rest, cut off)."""
         high = self._make("and.b32", self._make("add.u32", number, ROUND), KEPT)
-        return high, self._make("sub.f32", number, high, kind="r")
+        return high, self._make("and.b32", self._make("sub.f32", number, high), KEPT)
 
     def _mma(self, sums: list[str], first: list[str], second: tuple[str, ...], begins: bool) -> None:
         before = ["0f00000000"] * 4 if begins else sums
         parts = ", ".join(f"{{{', '.join(part)}}}" for part in (sums, first, second, before))
-        self._say(f"mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {parts}")
+        self._emit(f"mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {parts}")
 
     def _store(self, total: list[list[list[str]]]) -> None:
         """The block's tile of the result."""
@@ -357,8 +359,8 @@ class ProductText:
                     two, active, offset = four[2 * half : 2 * half + 2], is_row, 8 * j * BYTES
                     if bias:
                         for value in two:
-                            self._say(f"add.f32 {value}, {value}, {bias}")
-                            self._say(f"max.f32 {value}, {value}, 0f00000000")
+                            self._emit(f"add.f32 {value}, {value}, {bias}")
+                            self._emit(f"max.NaN.f32 {value}, {value}, 0f00000000")
                     if beside:
                         self._mask(two, f"[{beside}+{offset}]", is_row)
                     if self.kind == "outer":
@@ -382,4 +384,4 @@ class ProductText:
         self._lines.append(f"@{is_row} ld.global.nc.v2.f32 {{{', '.join(beside)}}}, {source};")
         for value, other in zip(two, beside, strict=True):
             is_on = self._make("setp.gt.f32", other, "0f00000000", kind="p")
-            self._say(f"selp.f32 {value}, {value}, 0f00000000, {is_on}")
+            self._emit(f"selp.f32 {value}, {value}, 0f00000000, {is_on}")
