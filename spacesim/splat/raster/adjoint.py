@@ -84,7 +84,7 @@ def by_tiles(
         record = state.records.load(lists, k)
         dx, dy = thread.x - record[0], thread.y - record[1]
         a, b, c = record[2], record[3], record[4]
-        powers = exponents(record, thread.x, thread.y, shape)
+        powers = list(exponents(record, thread.x, thread.y, shape, blocks=True))
         transmittance, behind = list(transmittance), list(behind)
         moments = _PixelMoments(dx, dy)
         absolute_x, absolute_y = ad.Float(0), ad.Float(0)
@@ -103,11 +103,12 @@ def by_tiles(
             behind[p] = dr.fma(weight, along, behind[p])
             transmittance[p] += weight
             g = dr.select(unclamped < ALPHA_MAX, grad_log_alpha, 0)
-            g_dy = moments.add(i, j, g)
+            moments.add(i, j, g)
             # records hold -a/2, -b, -c/2 in units of log2 e; the factor is put back with the sums below
             if absolute:
-                absolute_x += dr.abs(dr.fma(b, g_dy, 2 * a * (dx + i) * g))
-                absolute_y += dr.abs(dr.fma(2 * c, g_dy, b * (dx + i) * g))
+                size = dr.abs(g)
+                absolute_x = dr.fma(size, dr.abs(2 * a * (dx + i) + b * (dy + j)), absolute_x)
+                absolute_y = dr.fma(size, dr.abs(b * (dx + i) + 2 * c * (dy + j)), absolute_y)
         sums = moments.sums()
         sums += [absolute_x, absolute_y, *grad_features] if absolute else grad_features
         _add_to_slots(slots, sums, lists.sum_index(k), mode)
@@ -128,13 +129,12 @@ class _PixelMoments:
         self.dx, self.dy = dx, dy
         self.columns: dict[int, list[Float]] = {}
 
-    def add(self, column: int, row: int, g: Float) -> Float:
-        """A pixel's g. Returns g dy."""
+    def add(self, column: int, row: int, g: Float) -> None:
+        """A pixel's g."""
         dy = self.dy + row
         g_dy = g * dy
         s0, s1, s2 = self.columns.get(column, [ad.Float(0)] * 3)
         self.columns[column] = [s0 + g, s1 + g_dy, dr.fma(g_dy, dy, s2)]
-        return g_dy
 
     def sums(self) -> list[Float]:
         """The six."""
@@ -265,7 +265,7 @@ def _add_pixel(
     of what is behind). A state that blending did not keep has no part, since `blends` is false."""
     (px, py), (transmittance, behind), channels = centre, state, len(gradients)
     dx, dy = px - record[0], py - record[1]
-    power = exponents(record, px, py, ONE_PIXEL)[0]
+    (power,) = exponents(record, px, py, ONE_PIXEL)
     unclamped = exp2(power)
     alpha = dr.minimum(unclamped, ALPHA_MAX)
     blends &= power >= POWER_MIN

@@ -145,10 +145,9 @@ def _walk(
         for u in range(turn):
             listed = k + u < end if u else ad.Bool(True)
             record = records.load(lists, k + u, listed)
-            powers = exponents(record, thread.x, thread.y, shape)
-            for p in range(shape.pixels):
-                shows = listed & (powers[p] >= POWER_MIN)
-                weight = dr.minimum(exp2(powers[p]), ALPHA_MAX) * transmittance[p]
+            for p, power in enumerate(exponents(record, thread.x, thread.y, shape, blocks=True)):
+                shows = listed & (power >= POWER_MIN)
+                weight = dr.minimum(exp2(power), ALPHA_MAX) * transmittance[p]
                 behind = transmittance[p] - weight  # negative where the pixel is finished: it blends nothing more
                 blends = shows & ((behind > TRANSMITTANCE_MIN) | ~walks.finishes[p])
                 weight = dr.select(blends, weight, 0)

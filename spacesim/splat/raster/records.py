@@ -1,6 +1,7 @@
 """What blending and its adjoints read: splats as records, and their alphas at a thread's pixels."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import cast
 
@@ -8,6 +9,7 @@ import drjit as dr
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.blocks import new_block
 from spacesim.backend.packet import load, packets, store
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
@@ -87,15 +89,17 @@ def list_records(packed: list[Float], lists: TileLists, capacity: int) -> Listed
     return ListedRecords(ordered, capacity)
 
 
-def exponents(record: list[Float], px: Float, py: Float, shape: TileShape) -> list[Float]:
-    """log2 of the unclamped alpha (thesis 2.14) at the pixels of a thread whose first is centred at (px, py)."""
-    powers: list[Float] = []
+def exponents(record: list[Float], px: Float, py: Float, shape: TileShape, blocks: bool = False) -> Iterator[Float]:
+    """log2 of the unclamped alpha (thesis 2.14) at the pixels of a thread whose first is centred at (px, py), one by
+    one. blocks: each, and what is done before the next is asked for, is a `new_block`"""
     for i in range(shape.columns):
         dx, dy = px + i - record[0], py - record[1]
         constant = dr.fma(record[2] * dx, dx, record[5])
         linear = record[3] * dx
-        powers += [dr.fma(dr.fma(record[4], dy + j, linear), dy + j, constant) for j in range(shape.rows)]
-    return powers
+        for j in range(shape.rows):
+            if blocks:
+                new_block()
+            yield dr.fma(dr.fma(record[4], dy + j, linear), dy + j, constant)
 
 
 def exp2(power: Float) -> Float:

@@ -77,7 +77,7 @@ def _weighing(splats: Splats, lists: TileLists, size: tuple[int, int], least: fl
         return (k < end) & reduce(or_, (passed > open_still for passed in transmittance))
 
     def pass_through(k: UInt32, transmittance: list[Float]) -> tuple[UInt32, list[Float]]:
-        powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
+        powers = list(exponents(records.load(lists, k), thread.x, thread.y, lists.shape))
         weights = []
         for power, passed in zip(powers, transmittance, strict=True):
             shows = (power >= POWER_MIN) & (passed > open_still)

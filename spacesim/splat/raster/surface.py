@@ -89,7 +89,7 @@ def walk(splats: Splats, lists: TileLists, width: int, height: int, capacity: in
         """place: one past the last pair behind which half of the light passes; alphas are from 0 to `ALPHA_MAX`, so
         none follows it"""
         transmittance, place = list(transmittance), list(place)
-        powers = exponents(records.load(lists, k), thread.x, thread.y, lists.shape)
+        powers = list(exponents(records.load(lists, k), thread.x, thread.y, lists.shape))
         for p in range(pixels):
             drawn = dr.minimum(exp2(powers[p]), ALPHA_MAX)
             alpha = dr.select(powers[p] >= POWER_MIN, drawn, 0)

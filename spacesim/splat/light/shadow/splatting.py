@@ -168,7 +168,7 @@ def occlusion_in_events(
         numbers = [dr.gather(ad.UInt32, lists.splat, k + u, listed[u]) for u in range(turn)]
         loaded = [records.load(lists, k + u, listed[u]) for u in range(turn)]
         for u, record in enumerate(loaded):
-            powers, receiver = exponents(record, thread.x, thread.y, shape), numbers[u] < batch.room
+            powers, receiver = list(exponents(record, thread.x, thread.y, shape)), numbers[u] < batch.room
             if branches:
                 state = k + u, powers, transmittance, listed[u]
                 transmittance = dr.if_stmt(state, receiver, note, block, mode="symbolic")

@@ -9,6 +9,7 @@ in no list. How the lists are put in order depends on the backend, the order doe
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
+from math import gcd
 from typing import Any
 
 import drjit as dr
@@ -27,7 +28,6 @@ from spacesim.splat.raster.project import Footprints, Splats
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
 MAX_SORTED_LENGTH = 2**DIGIT_BITS - 1  #: entries of a list, from which on lists count as equally long
 PACKET = 16  #: SIMD lanes that run together on a CPU with AVX-512; elsewhere fewer
-MAX_SHARES = 64  #: at most: no fewer than the parts into which Dr.Jit divides a launch, two a thread, as a rule
 
 
 def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, few_sizes: bool = False) -> TileLists:
@@ -130,29 +130,31 @@ def _expand(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> 
 
 
 def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
-    """Tiles by the lengths [T] of their lists, longest first, then dealt into `MAX_SHARES` shares.
+    """Tiles by the lengths [T] of their lists, longest first, in packets that are then spread by the golden ratio.
 
     Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
-    CPU threads take runs of packets: each share has long lists and short ones.
+    CPU threads take runs of packets: each run, of whatever length, has long lists and short ones alike.
     """
     count = dr.width(length)
     sorted_ = _stable_order(MAX_SORTED_LENGTH - dr.minimum(length, MAX_SORTED_LENGTH), MAX_SORTED_LENGTH.bit_length())
     group = max(PACKET // shape.threads, 1)
     groups = count // group
-    shares = min(MAX_SHARES, groups // 4)
-    if shares < 2:
+    stride = _golden_stride(groups)
+    if stride < 2:
         return sorted_
     index = dr.arange(ad.UInt32, count)
-    packet, within = index // group, index % group
-    quotient, remainder = divmod(groups, shares)  # the first `remainder` shares have one group more
-    in_first = packet < remainder * (quotient + 1)
-    rest = packet - remainder * (quotient + 1)
-    share = dr.select(in_first, packet // (quotient + 1), remainder + rest // quotient)
-    turn = dr.select(in_first, packet % (quotient + 1), rest % quotient)
-    back = (turn % 2 == 1) & (turn < quotient)  # there and back, as long as all get one
-    share = dr.select(back, shares - 1 - share, share)
-    is_dealt = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
-    return dr.gather(ad.UInt32, sorted_, dr.select(is_dealt, (turn * shares + share) * group + within, index))
+    rank = ad.UInt32(ad.UInt64(index // group) * stride % groups)
+    is_spread = index < groups * group  # the last few tiles, with the shortest lists, stay where they are
+    return dr.gather(ad.UInt32, sorted_, dr.select(is_spread, rank * group + index % group, index))
+
+
+def _golden_stride(count: int) -> int:
+    """About the golden part of `count`, and without a common divisor: multiples of it, modulo `count`, are all numbers
+    below it once, and those of any run are spread evenly."""
+    stride = round(0.618034 * count)
+    while gcd(stride, count) > 1:
+        stride += 1
+    return stride
 
 
 def _stable_order(keys: UInt32, bits: int) -> UInt32:

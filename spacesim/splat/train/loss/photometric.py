@@ -13,6 +13,7 @@ import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
+from spacesim.backend.blocks import new_block
 
 RADIUS = 5  #: 11 x 11 window
 SIGMA = 1.5  #: pixels
@@ -134,12 +135,14 @@ def _similarity(means: Sequence[Float], inside: Bool) -> tuple[Float, Float, Flo
 
 
 def _blur(values: Sequence[Float]) -> list[Float]:
-    """Of neighbours, the blurred ones but RADIUS at each end."""
+    """Of neighbours, the blurred ones but RADIUS at each end. The window is symmetric: two neighbours meet before they
+    are weighed, and sums and products run side by side."""
     result = []
-    for j in range(len(values) - 2 * RADIUS):
-        total = values[j] * WINDOW[0]
-        for k in range(1, len(WINDOW)):
-            total = dr.fma(values[j + k], WINDOW[k], total)
+    for j in range(RADIUS, len(values) - RADIUS):
+        new_block()
+        total = values[j] * WINDOW[RADIUS]
+        for k in range(1, RADIUS + 1):
+            total = dr.fma(values[j - k] + values[j + k], WINDOW[RADIUS + k], total)
         result.append(total)
     return result
 
