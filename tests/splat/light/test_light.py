@@ -433,6 +433,8 @@ def test_shading_and_its_adjoint_match_the_equations_in_float64(name, earth):
 
 @pytest.mark.usefixtures("_products")
 def test_gradients_of_what_is_shaded_go_through_networks():
+    if select() == "cuda":
+        pytest.skip("there Dr.Jit does not differentiate the loop of the last layer, in neither way")
     light, splats = model("relight"), gaussians(37, FIELD.features)
     dr.enable_grad(splats.means)
     shading = light.shade(splats, eye(), SUN, picture=3)
