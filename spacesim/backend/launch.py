@@ -5,12 +5,12 @@ does Dr.Jit's, so nothing else is needed. No recording takes in such a kernel: i
 """
 
 import ctypes
-import os
 from collections.abc import Sequence
 from ctypes import POINTER, addressof, byref, c_char_p, c_float, c_int, c_uint, c_uint32, c_uint64, c_void_p
 from functools import cache
 from typing import Any
 
+from spacesim.backend.memory import CUDA_DRIVER
 from spacesim.backend.readback import dr_library
 from spacesim.backend.recording import one_at_a_time
 from spacesim.backend.selection import load_drjit
@@ -122,7 +122,7 @@ class _Driver:
         """Raises RuntimeError where driver, context or stream are not to be had by these names."""
         library = dr_library()
         try:
-            self._driver = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+            self._driver = ctypes.CDLL(CUDA_DRIVER)
             handles = [library[name] for name in ("_Z16jit_cuda_contextv", "_Z15jit_cuda_streamv")] if library else []
             self._functions = {name: self._driver[name] for name in _ARGUMENTS}
         except (OSError, AttributeError) as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from spacesim.backend.selection import load_drjit, select
 
+CUDA_DRIVER = "nvcuda.dll" if os.name == "nt" else "libcuda.so.1"
 LARGE = 1 << 28  #: bytes below which free memory is not checked: checking it reads files of the system
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's `mallopt`
 _KEPT, _LARGEST_KEPT = 1 << 30, 1 << 25  # bytes: freed in all, and of an array, of which older glibc allow no more
@@ -115,7 +116,7 @@ def check_free_memory(needed: int, what: str) -> None:
 def device_memory() -> int | None:
     """Bytes free on the first CUDA device, which Dr.Jit uses, by the driver; None where that does not say."""
     try:
-        driver = ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+        driver = ctypes.CDLL(CUDA_DRIVER)
     except OSError:
         return None
     context, free, total = ctypes.c_void_p(), ctypes.c_size_t(), ctypes.c_size_t()

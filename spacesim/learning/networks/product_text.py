@@ -8,6 +8,7 @@ A block has a tile of `ROWS` x `COLUMNS` of the result; tiles of both factors co
 shared memory, while the last ones are multiplied. Which thread holds which entries: PTX ISA, "mma.m16n8k8".
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -296,40 +297,27 @@ class ProductText:
     def _multiply_eight(self, read: list[str], k: int, sums: list[list[list[str]]]) -> None:
         """Add the products of eight columns and rows, from k on, to the sums, which begin at k = 0."""
         tall, wide = WARP_ROWS // 16, WARP_COLUMNS // 8
-        firsts = [self._read_first(read[0], 16 * i, k) for i in range(tall)]
-        seconds = [self._read_second(read[1], 8 * j, k) for j in range(0, wide, 2)]
+        firsts = [self._fragment(0, read[0], 16 * i, k, ((0, 0), (8, 0), (0, 4), (8, 4))) for i in range(tall)]
+        pairs = [self._fragment(1, read[1], 8 * j, k, ((0, 0), (0, 4), (8, 0), (8, 4))) for j in range(0, wide, 2)]
+        seconds = [half for four in pairs for half in (four[:2], four[2:])]
         split = [[self._halves(number) for number in numbers] for numbers in firsts]
-        for j, numbers in enumerate(pair for pairs in seconds for pair in pairs):
+        for j, numbers in enumerate(seconds):
             high, low = zip(*[self._halves(number) for number in numbers], strict=True)
             for which, other in ((1, high), (0, low), (0, high)):
                 for i in range(tall):
                     begins = k == 0 and which == 1
                     self._mma(sums[i][j], [halves[which] for halves in split[i]], other, begins)
 
-    def _read_first(self, start: str, row: int, k: int) -> list[str]:
-        """Four numbers of 16 x 8."""
-        tile = self._tiles[0]
-        numbers = [self._new() for _ in range(4)]
+    def _fragment(self, number: int, start: str, i: int, k: int, corners: Sequence[tuple[int, int]]) -> list[str]:
+        """Four numbers of a factor's tile, from entry i, k on, each of 8 x 4 from its corner."""
+        tile, numbers = self._tiles[number], [self._new() for _ in range(4)]
         if tile.along_k:
-            self._ldmatrix(numbers, start, tile.at(row, k))
+            four = f"{{{', '.join(numbers)}}}, [{start}+{tile.at(i, k)}]"
+            self._emit(f"ldmatrix.sync.aligned.m8n8.x4.shared.b16 {four}")
         else:
-            for number, (i, below) in zip(numbers, ((0, 0), (8, 0), (0, 4), (8, 4)), strict=True):
-                self._emit(f"ld.shared.b32 {number}, [{start}+{tile.at(row + i, k + below)}]")
+            for register, (down, along) in zip(numbers, corners, strict=True):
+                self._emit(f"ld.shared.b32 {register}, [{start}+{tile.at(i + down, k + along)}]")
         return numbers
-
-    def _read_second(self, start: str, column: int, k: int) -> list[list[str]]:
-        """Two numbers each of two matrices 8 x 8, side by side."""
-        tile = self._tiles[1]
-        numbers = [self._new() for _ in range(4)]
-        if tile.along_k:
-            self._ldmatrix(numbers, start, tile.at(column, k))
-        else:
-            for number, (i, below) in zip(numbers, ((0, 0), (0, 4), (8, 0), (8, 4)), strict=True):
-                self._emit(f"ld.shared.b32 {number}, [{start}+{tile.at(column + i, k + below)}]")
-        return [numbers[:2], numbers[2:]]
-
-    def _ldmatrix(self, numbers: list[str], start: str, offset: int) -> None:
-        self._emit(f"ldmatrix.sync.aligned.m8n8.x4.shared.b16 {{{', '.join(numbers)}}}, [{start}+{offset}]")
 
     def _halves(self, number: str) -> tuple[str, str]:
         """(what TF32 keeps of a number, rounded, and of the rest, cut off)."""
