@@ -88,31 +88,21 @@ def backward(
     return backward_together([WayBack(shape, weights, tape, shared, grad_output)])[0]
 
 
-def backward_together(ways: list[WayBack]) -> list[tuple[list[Float], TensorXf]]:
-    """`backward` of networks whose items are the columns of as many matrices: they share the kernels that are small."""
-    if select() == "llvm":
+def backward_together(
+    ways: list[WayBack], hidden: warps.HiddenGradients | None = None
+) -> list[tuple[list[Float], TensorXf]]:
+    """`backward` of networks whose items are the columns of as many matrices: they share the kernels that are small.
+    hidden: of the first network, if its hidden layers were gone through elsewhere, on CUDA"""
+    if hidden is None and select() == "llvm":
         return [_backward(way) for way in ways]
     matrices, _, m = ways[0].grad_output.shape
-    sums = warps.WarpSums(matrices, m, sum(warps.rows_summed(way.shape) for way in ways))
-    parts, grad_items = zip(*(warps.backward(way, sums) for way in ways), strict=True)
-    return list(zip(warps.totals(ways, list(parts), [sums.of_matrices()]), grad_items, strict=True))
-
-
-def backward_with_hidden(
-    way: WayBack, hidden: warps.HiddenGradients, others: list[WayBack]
-) -> list[tuple[list[Float], TensorXf]]:
-    """`backward_together` of a network whose hidden layers were gone through elsewhere, and others, on CUDA."""
-    matrices, _, m = way.grad_output.shape
-    rows = warps.rows_summed(way.shape, hidden=True) + sum(warps.rows_summed(other.shape) for other in others)
+    rows = sum(warps.rows_summed(way.shape, hidden is not None and way is ways[0]) for way in ways)
     sums = warps.WarpSums(matrices, m, rows)
-    parts = [warps.parts_of_hidden(way, hidden, sums)]
-    grad_items = [hidden.grad_items]
-    for other in others:
-        of_other, by_items = warps.backward(other, sums)
-        parts.append(of_other)
-        grad_items.append(by_items)
-    own_and_last = [sums.of_matrices(), hidden.last]
-    return list(zip(warps.totals([way, *others], parts, own_and_last), grad_items, strict=True))
+    passed = [warps.through_hidden(ways[0], hidden, sums)] if hidden else []
+    passed += [warps.backward(way, sums) for way in ways[len(passed) :]]
+    parts, grad_items = zip(*passed, strict=True)
+    own_and_last = [sums.of_matrices(), *([hidden.last] if hidden else [])]
+    return list(zip(warps.totals(ways, list(parts), own_and_last), grad_items, strict=True))
 
 
 def _backward(way: WayBack) -> tuple[list[Float], TensorXf]:

@@ -141,15 +141,15 @@ def through_last(way: WayBack) -> LastGradient:
     return LastGradient(gradient, sums.of_matrices(), way.input_matrix())
 
 
-def parts_of_hidden(way: WayBack, hidden: HiddenGradients, sums: WarpSums) -> list[Part]:
-    """As `backward` gives them."""
+def through_hidden(way: WayBack, hidden: HiddenGradients, sums: WarpSums) -> tuple[list[Part], TensorXf]:
+    """What `backward` gives."""
     rows, columns = way.shape.outputs, way.shape.width
     parts: list[Part] = []
     for i, matrix in enumerate(hidden.products):
         is_last = i == len(hidden.products) - 1
         bias = Row(LAST, rows * columns + rows) if is_last else sums.of_rows(hidden.gradients[i])
         parts += [matrix, bias]
-    return [*parts, Row(LAST, 0), Row(LAST, rows * columns)]
+    return [*parts, Row(LAST, 0), Row(LAST, rows * columns)], hidden.grad_items
 
 
 def totals(ways: list[WayBack], parts: list[list[Part]], sums: list[Float]) -> list[list[Float]]:

@@ -91,8 +91,7 @@ def _after_hidden(
     hidden: warps.HiddenGradients,
     by_sun: bool,
 ) -> tuple[Float, list[Float], list[Float], list[Float]]:
-    of_field, *others = _ways(config, weights, inputs, tape, gradients, by_sun)
-    by_networks = mlp.backward_with_hidden(of_field, hidden, others)
+    by_networks = mlp.backward_together(_ways(config, weights, inputs, tape, gradients, by_sun), hidden)
     return _gathered(config, weights, inputs, batch, gradients, by_networks, by_sun)
 
 
