@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
-from spacesim.backend.arrays import Bool, Float, Int32
+from spacesim.backend.arrays import Bool, Float, Int32, UInt32
 from spacesim.backend.upload import upload
 from spacesim.data.images import undistort_points
 from spacesim.data.records import Camera
@@ -37,6 +37,14 @@ class Tiles:
 
     marks: Bool  #: [ceil(H / TILE) ceil(W / TILE) + 1], row by row; at the end: all over
     wider: Float  #: times
+
+    def pixels(self, view: KernelCamera) -> UInt32:
+        """Those [N] of marked tiles, tile by tile, of a picture that is not wider; waits for the device."""
+        marks = self.marks.numpy()
+        tiles, side = np.flatnonzero(marks[:-1] | marks[-1])[:, None, None], np.arange(TILE)
+        row, column = tiles // _across(view) * TILE + side[:, None], tiles % _across(view) * TILE + side
+        is_inside = (row < view.height) & (column < view.width)
+        return upload((row * view.width + column)[is_inside], backend.mitsuba().UInt32)
 
     def may_show(self, view: KernelCamera, x: Float, y: Float) -> Bool:
         """Whether the scene may be seen in directions (x, y, 1) of `view`. Outside the picture it may be anywhere."""

@@ -10,7 +10,6 @@ frame.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
@@ -26,6 +25,7 @@ from spacesim.scenes.cameras.kernel_camera import KernelCamera, record_on_cuda
 from spacesim.scenes.coverage import Coverage, Tiles
 from spacesim.scenes.labels import OFFSET, Labeller
 from spacesim.scenes.lights.earth import EarthConfig
+from spacesim.scenes.samples import Noise, path_sampler, pixel_offsets
 from spacesim.scenes.scene import Scene, load
 from spacesim.scenes.steps import Steps, completed
 
@@ -33,10 +33,6 @@ MAX_WAVEFRONT = 1 << 24
 """Most samples in flight at once, 16 bytes each: more are rendered in several passes."""
 
 _EARTH = 1  # stream of random numbers
-
-_R2_STEPS = (3242174889, 2447445414)
-"""2^32 / g and 2^32 / g^2 with g^3 = g + 1 (Roberts 2018, "The unreasonable effectiveness of quasirandom
-sequences"): unsigned overflow keeps the fraction."""
 
 _DIRECTIONS = fibonacci_sphere(64)
 
@@ -68,10 +64,10 @@ class Renderer:
         self._loaded = load(scene)
         self._earth = scene.earth  # where it is now
         integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": True})
-        sampler = mi.load_dict({"type": "independent"})
         self._labeller = Labeller(scene, self._loaded, distortion)
         self._coverage = Coverage(scene, self._loaded.units, distortion)
-        self._sums = record_on_cuda(partial(_trace_paths, integrator, sampler, self._distortion))
+        self._lists_pixels = backend.select() == "llvm" and not any(distortion)  # a recording has all: one size
+        self._sums = record_on_cuda(partial(_trace_paths, integrator, self._distortion))
 
     def of(self, scene: Scene) -> "Renderer":
         """The same of another scene."""
@@ -129,19 +125,27 @@ class Renderer:
         """Sums of all passes (under the Sun, by the Earth's light, None without)."""
         view = KernelCamera.of(camera, self._loaded.units)
         tiles, earthlit = self._coverage.tiles(camera, view), self._loaded.earthlit
-        sunlight = self._launch_passes(self._loaded.sunlit, view, tiles, seed, spp)
-        return sunlight, self._launch_passes(earthlit, view, tiles, (*seed, _EARTH), spp) if earthlit else None
+        pixels = tiles.pixels(view) if self._lists_pixels else None
+        sunlight = self._launch_passes(self._loaded.sunlit, view, tiles, pixels, seed, spp)
+        return sunlight, self._launch_passes(earthlit, view, tiles, pixels, (*seed, _EARTH), spp) if earthlit else None
 
     def _launch_passes(
-        self, scene: mt.Scene, view: KernelCamera, tiles: Tiles, seed: Sequence[int], spp: int
+        self,
+        scene: mt.Scene,
+        view: KernelCamera,
+        tiles: Tiles,
+        pixels: UInt32 | None,
+        seed: Sequence[int],
+        spp: int,
     ) -> list[AsyncArray]:
         """Sums over samples, as `_trace_paths` returns them, of each pass; the device may still be at work on them."""
         uint = backend.mitsuba().UInt32
         passes = min(spp, -(-spp * view.width * view.height // MAX_WAVEFRONT))
         seeds = [dr.opaque(uint, int(state)) for state in np.random.SeedSequence(seed).generate_state(passes)]
         firsts = [spp * i // passes for i in range(passes + 1)]
-        noise = [_Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])) for i in range(passes)]
-        return [AsyncArray(self._sums(scene, view, tiles, noise[i], firsts[i + 1] - firsts[i])) for i in range(passes)]
+        noise = [Noise(seeds[i], seeds[0], dr.opaque(uint, firsts[i])) for i in range(passes)]
+        counts = np.diff(firsts).tolist()
+        return [AsyncArray(self._sums(scene, view, tiles, pixels, noise[i], counts[i])) for i in range(passes)]
 
     def inside(self, positions: Array) -> np.ndarray:
         """[N] bool: which of the `positions` [N, 3] are within a part.
@@ -170,40 +174,42 @@ class Renderer:
         return np.any(free.numpy().reshape(len(points), -1), axis=1)
 
 
-@dataclass(frozen=True)
-class _Noise:
-    """Of one pass, inputs of kernels."""
-
-    sampler: UInt32  #: seeds
-    shift: UInt32  #: seeds
-    first: UInt32  #: number of the pass's first sample
-
-
 def _trace_paths(
     integrator: mt.Integrator,
-    sampler: mt.Sampler,
     distortion: Sequence[float],
     scene: mt.Scene,
     view: KernelCamera,
     tiles: Tiles,
-    noise: _Noise,
+    pixels: UInt32 | None,
+    noise: Noise,
     spp: int,
 ) -> Float:
-    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]. tiles: where there is something to see"""
+    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]. tiles: where there is something to see;
+    pixels: the others are not traced, None: none is left out"""
     mi = backend.mitsuba()
-    samples = spp * view.width * view.height
-    sampler = sampler.fork()  # a state that was there before must not be freed in a recording
-    sampler.seed(noise.sampler, samples)
-    index = dr.arange(mi.UInt32, samples)
-    pixel = index // spp
-    offset = _pixel_offsets(pixel, index - pixel * spp + noise.first, noise.shift)
+    size = view.width * view.height
+    traced = size if pixels is None else dr.width(pixels)
+    if traced == 0:
+        return dr.zeros(mi.Float, 4 * size)
+    index = dr.arange(mi.UInt32, spp * traced)
+    place = index // spp
+    sample = index - place * spp
+    pixel = place if pixels is None else dr.gather(mi.UInt32, pixels, place)
+    offset = pixel_offsets(pixel, sample + noise.first, noise.shift)
     x, y = view.directions(pixel, offset, distortion)
     ray, _ = view.rays_to(x, y)
+    sampler = path_sampler(noise.paths, pixel * spp + sample)
     radiance, hit, _ = integrator.sample(scene, sampler, ray, active=tiles.may_show(view, x, y))
     channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
     dr.eval(channels)
     *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)
-    return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
+    if pixels is None:
+        return dr.concat([dr.ravel(mi.Color3f(rgb)), alpha])
+    sums = dr.zeros(mi.Float, 4 * size)
+    for k, channel in enumerate(rgb):
+        dr.scatter(sums, channel, 3 * pixels + k)
+    dr.scatter(sums, alpha, 3 * size + pixels)
+    return sums
 
 
 def _mean_radiance(sums: Sequence[AsyncArray], camera: Camera, spp: int) -> tuple[np.ndarray, np.ndarray]:
@@ -214,15 +220,6 @@ def _mean_radiance(sums: Sequence[AsyncArray], camera: Camera, spp: int) -> tupl
     total /= np.float32(spp)
     shape = camera.height, camera.width
     return total[: -math.prod(shape)].reshape(*shape, 3), total[-math.prod(shape) :].reshape(shape)
-
-
-def _pixel_offsets(pixel: UInt32, sample: UInt32, seed: UInt32) -> mt.Point2f:
-    """Where in its pixel a sample lies, in [0, 1)^2: the R2 sequence, shifted at random for each pixel, so
-    that few samples cover it evenly."""
-    mi = backend.mitsuba()
-    shift = mi.sample_tea_32(pixel, seed)
-    fractions = [(sample * step + start) >> 8 for step, start in zip(_R2_STEPS, shift, strict=True)]
-    return mi.Point2f(*(mi.Float(fraction) * 2.0**-24 for fraction in fractions))
 
 
 def _gather(vectors: Array, index: UInt32) -> mt.Vector3f:

@@ -212,11 +212,12 @@ def load(scene: Scene) -> MitsubaScene:
     }
     watertight = {"embree_use_robust_intersections": True} if backend.select() == "llvm" else {}  # OptiX always is
     labelled = mi.load_dict({"type": "scene", **watertight, **shapes})
-    sun = solar_disc(scene.sun, scene.earth)
+    outside = not any(both_sides or material.bsdf["type"] == "twosided" for material, both_sides, _ in alike)
+    sun = solar_disc(scene.sun, scene.earth, outside)
     sunlit = mi.load_dict({"type": "scene", "sun": sun, **shapes})
     if scene.earth is None:
         return MitsubaScene(units, parts_of, labelled, sunlit, sun)
-    earth = earthshine(scene.earth, scene.sun)
+    earth = earthshine(scene.earth, scene.sun, outside)
     earthlit = mi.load_dict({"type": "scene", "earth": earth, **shapes})
     return MitsubaScene(units, parts_of, labelled, sunlit, sun, earthlit, earth)
 

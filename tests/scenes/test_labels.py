@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 import raycast
@@ -11,6 +12,7 @@ import trimesh
 from raycast import RayCaster
 from trimesh.ray.ray_triangle import RayMeshIntersector
 
+from spacesim import backend
 from spacesim.data.records import Camera, Sun
 from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
@@ -18,6 +20,7 @@ from spacesim.scenes.lights.sun import SunConfig
 from spacesim.scenes.render import Renderer
 from spacesim.scenes.scene import Scene
 from spacesim.scenes.scenefile import read_scene
+from spacesim.scenes.visibility import SolarDirections
 
 
 @pytest.mark.parametrize(
@@ -142,6 +145,25 @@ def test_rays_and_triangles_by_hand():
     face, depth = raycast.first_below(points, corners, depths, floor)
     assert face.tolist() == [1, 0, -1, 1, -1, 0]
     np.testing.assert_allclose(depth, [1.0, 2.75, np.inf, 1.0, np.inf, 3.0])
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 33.0])
+def test_neighbouring_rays_to_the_sun_meet_what_each_alone_does(azimuth_deg):
+    """Beside a direction that has a component of some 1e-19 Embree's coherent rays would miss much."""
+    mi = backend.mitsuba()
+    scene = build(read_scene("telescope"))
+    renderer, sun = Renderer(scene, spp=1), Sun.from_angles(azimuth_deg, 3.75)
+    disc = SolarDirections(scene.sun).few(sun, None)
+    start = renderer._loaded.units.points(scene.mesh.triangles_center + 1e-3 * scene.mesh.face_normals)
+    start = start[scene.mesh.face_normals @ sun.direction > 0].astype(np.float32)
+    turned = mi.Vector3f(sun.direction.tolist()) + dr.zeros(mi.Vector3f, len(start))
+    _, hidden, _ = disc.seen(
+        renderer._loaded.labelled, mi.Vector3f(start.T), turned, dr.full(mi.Bool, True, len(start))
+    )
+    each = np.repeat(start, disc.count, 0), np.tile(np.array(disc.directions).T, (len(start), 1))
+    alone = renderer._loaded.labelled.ray_test(mi.Ray3f(mi.Point3f(each[0].T), mi.Vector3f(each[1].T))).numpy()
+    assert 0.1 < alone.mean() < 0.9
+    np.testing.assert_array_equal(hidden.numpy(), alone)
 
 
 def test_labels_are_zero_where_there_is_no_surface():

@@ -12,6 +12,7 @@ from spacesim.data.store import SHADOW_SELF_CAST
 from spacesim.scenes import render
 from spacesim.scenes.build import build
 from spacesim.scenes.generation.generate import plan_views
+from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import Material, material
 from spacesim.scenes.render import Renderer
@@ -110,6 +111,29 @@ def test_sun_can_be_moved_and_moved_back():
     first, other, again = (renderer.render(camera, sun, seed=(2,)).radiance for sun in suns)
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 100
+
+
+def test_no_ray_asks_for_shadow_where_a_closed_surface_faces_away():
+    """Which changes no bit; sheets and two-sided materials are lit on either side."""
+    scene = replace(build(read_scene("boxsat")), earth=EarthConfig(20.0, 30.0))
+    camera, sun = Camera.from_fov(look_at([9, 5, 4], [0, 0, 0]), 48, 48, 40.0), Sun.from_angles(120, 10)
+    renderers = Renderer(scene, spp=8), Renderer(scene, spp=8)
+    for source in (renderers[0]._loaded.sun, renderers[0]._loaded.earth):
+        assert source.outside
+        source.outside = False
+    every, fewer = (renderer.render(camera, sun, seed=(3,)) for renderer in renderers)
+    assert ((every.sun_cosine < 0) & (every.object_id > 0)).sum() > 100
+    np.testing.assert_array_equal(every.radiance, fewer.radiance)
+
+    grey = material("lambertian-grey")
+    wrapped = replace(grey, bsdf={"type": "twosided", "bsdf": grey.bsdf})
+    inverted = trimesh.creation.box((2, 2, 2))
+    inverted.invert()
+    sheet = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 2, 1], [0, 3, 2]], process=False)
+    for mesh, surface in ((sheet, grey), (inverted, wrapped)):
+        above = Camera.from_fov(look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), 8, 8, 5.0)
+        seen = Renderer(scene_of(mesh, surface), spp=2).render(above, Sun.from_angles(0, 90), seed=(1,))
+        assert seen.radiance.min() * EXPOSURE > 0.1, "its normals point down"
 
 
 def test_inside_and_exposed():

@@ -65,10 +65,12 @@ def _classes() -> tuple[type, type]:
     mi = backend.mitsuba()
 
     class Distant(mi.Emitter):  # type: ignore[name-defined]
-        """Light from directions alone. Subclasses say what shines (`shines`) and how it is sampled (`draw`)."""
+        """Light from directions alone. Subclasses say what shines (`shines`) and how it is sampled (`draw`). outside:
+        surfaces reflect on the side of their normals alone, so where one faces away no ray has to ask for shadow."""
 
-        def __init__(self) -> None:
+        def __init__(self, outside: bool) -> None:
             mi.Emitter.__init__(self, mi.Properties())
+            self.outside = outside
             self.m_flags = mi.EmitterFlags.Infinite
             self.reach = kernel_input(1e7)  # metres: beyond any scene, so that every part between casts a shadow
 
@@ -82,8 +84,9 @@ def _classes() -> tuple[type, type]:
             ds.d = self.draw(sample)
             ds.dist, ds.n, ds.uv, ds.time = self.reach, -ds.d, sample, it.time
             ds.p = it.p + ds.d * ds.dist
-            ds.pdf, ds.delta, ds.emitter = self.density, False, mi.EmitterPtr(self)
-            return ds, dr.select(active, self.shines(ds.d, drawn=True) / self.density, 0)
+            asked = dr.dot(it.n, ds.d) > 0 if self.outside else mi.Bool(True)
+            ds.pdf, ds.delta, ds.emitter = dr.select(asked, self.density, 0), False, mi.EmitterPtr(self)
+            return ds, dr.select(active & asked, self.shines(ds.d, drawn=True) / self.density, 0)
 
         def pdf_direction(self, it: mt.Interaction3f, ds: mt.DirectionSample3f, active: Bool | bool = True) -> Float:
             return dr.select(active & self.covers(ds.d), self.density, 0)
@@ -97,8 +100,8 @@ def _classes() -> tuple[type, type]:
         """A disc of even radiance; its rim is `angular_radius` from `direction`. Of parallel light every draw is the
         direction itself, and no path that scatters meets it."""
 
-        def __init__(self, sun: SunConfig, earth: EarthConfig | None) -> None:
-            super().__init__()
+        def __init__(self, sun: SunConfig, earth: EarthConfig | None, outside: bool) -> None:
+            super().__init__(outside)
             radius = sun.angular_radius
             self.sine, self.chord = kernel_input(math.sin(radius)), kernel_input(4 * math.sin(radius / 2) ** 2)
             size = math.pi * max(math.sin(radius), PARALLEL) ** 2  # the cosine to the axis is 1 within 1e-5 at 1 au
@@ -134,8 +137,8 @@ def _classes() -> tuple[type, type]:
         """Sunlight that a Lambertian sphere reflects: radiance albedo E / pi max(n . s, 0), n its normal where a
         direction meets it. Its night side is dark."""
 
-        def __init__(self, earth: EarthConfig, sun: SunConfig) -> None:
-            super().__init__()
+        def __init__(self, earth: EarthConfig, sun: SunConfig, outside: bool) -> None:
+            super().__init__(outside)
             self.place(earth)
             self.full = mi.Color3f(kernel_input(earth.albedo / math.pi * sun.irradiance))
             self.point(Sun(np.array([1.0, 0.0, 0.0])))
@@ -166,11 +169,12 @@ def _classes() -> tuple[type, type]:
     return SolarDisc, Earthshine
 
 
-def solar_disc(sun: SunConfig, earth: EarthConfig | None = None) -> Source:
-    """The Sun as a Mitsuba emitter; the Earth hides it where it is before it."""
-    return _classes()[0](sun, earth)
+def solar_disc(sun: SunConfig, earth: EarthConfig | None = None, outside: bool = False) -> Source:
+    """The Sun as a Mitsuba emitter; the Earth hides it where it is before it. outside: every surface is closed, and
+    reflects on its outside alone."""
+    return _classes()[0](sun, earth, outside)
 
 
-def earthshine(earth: EarthConfig, sun: SunConfig) -> Source:
-    """The Earth as a Mitsuba emitter."""
-    return _classes()[1](earth, sun)
+def earthshine(earth: EarthConfig, sun: SunConfig, outside: bool = False) -> Source:
+    """The Earth as a Mitsuba emitter. outside: as for the Sun"""
+    return _classes()[1](earth, sun, outside)
