@@ -1,4 +1,5 @@
-"""Which parts of a picture may show the scene: paths through the others are not traced, which changes no bit.
+"""Which parts of a picture may show the scene: paths through the others are not traced, which changes no bit (but where
+two surfaces share a place: Embree chooses by what it traces at once).
 
 A triangle covers at most the tiles that its projection, widened by a margin, reaches (J. Hasselgren, T. Akenine-Möller
 and L. Ohlsson, "Conservative rasterization", GPU Gems 2, 2005).

@@ -1,6 +1,7 @@
 """Samples of a picture: where they lie in their pixels, and the random numbers of their paths.
 
-Both depend on a sample's own pixel and number, not on which others are traced.
+Both depend on a sample's own pixel and number, not on which others are traced. (Of surfaces in one place, Embree's
+choice may.)
 """
 
 from dataclasses import dataclass

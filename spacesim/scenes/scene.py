@@ -15,7 +15,7 @@ from spacesim import backend
 from spacesim.backend import mitsuba_types as mt
 from spacesim.backend.upload import upload
 from spacesim.data.errors import InputError
-from spacesim.data.files import JsonDict
+from spacesim.data.files import JsonDict, JsonMapping
 from spacesim.data.geometry import Array, normalize
 from spacesim.data.records import Sun
 from spacesim.scenes.cameras.kernel_camera import Units
@@ -26,6 +26,7 @@ from spacesim.scenes.materials.table import Material
 from spacesim.scenes.meshes.parts import is_closed_mesh
 from spacesim.scenes.spacecraft import Part, Spacecraft
 
+ONE_SIDED = ("diffuse", "principled", "roughconductor")  #: Mitsuba's BSDFs that show nothing on the side of -n
 MAX_OBJECTS, MAX_PARTS = 84, 255  #: 170 + object id is a shadow class below 255, part ids are bytes
 
 
@@ -212,7 +213,7 @@ def load(scene: Scene) -> MitsubaScene:
     }
     watertight = {"embree_use_robust_intersections": True} if backend.select() == "llvm" else {}  # OptiX always is
     labelled = mi.load_dict({"type": "scene", **watertight, **shapes})
-    outside = not any(both_sides or material.bsdf["type"] == "twosided" for material, both_sides, _ in alike)
+    outside = all(flat and not both_sides and _is_one_sided(material.bsdf) for material, both_sides, flat in alike)
     sun = solar_disc(scene.sun, scene.earth, outside)
     sunlit = mi.load_dict({"type": "scene", "sun": sun, **shapes})
     if scene.earth is None:
@@ -288,6 +289,13 @@ def box_projection(mesh: trimesh.Trimesh) -> Array:
     axis = np.abs(mesh.face_normals).argmax(axis=1)
     across = np.array([[1, 2], [0, 2], [0, 1]])[axis]  # [F, 2]
     return np.take_along_axis(mesh.triangles, across[:, None, :], axis=2).reshape(-1, 2)
+
+
+def _is_one_sided(bsdf: JsonMapping) -> bool:
+    """Whether it reflects on the side of its normals alone, and lets nothing through."""
+    while bsdf["type"] == "normalmap":
+        bsdf = bsdf["bsdf"]
+    return bsdf["type"] in ONE_SIDED and "spec_trans" not in bsdf
 
 
 def _mitsuba_bsdf(material: Material, both_sides: bool) -> mt.BSDF:

@@ -21,7 +21,7 @@ from spacesim.scenes.shapes import axis_frame
 RIM = 8  #: directions on the rim: a straight edge that passes between two of them hides 1.2 % of the disc at most
 FINE = 256  #: directions all over the disc: steps of 0.4 %
 LEAST = 1e-9
-"""Of a direction's components but 0: beside one below 1e-18 Embree's coherent rays miss a fifth of what they meet."""
+"""Of the components of a ray's direction but 0: beside one below 1e-18 Embree's coherent rays miss much."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ class Disc:
         is_active = dr.gather(mi.Bool, active, point)
         start, axis = (mi.Vector3f(*(dr.gather(mi.Float, x, point) for x in vector)) for vector in (origin, normal))
         direction = dr.gather(mi.Vector3f, self.directions, index - point * self.count)
-        ray = mi.Ray3f(mi.Point3f(start), direction)
+        along = mi.Vector3f(*(dr.select(dr.abs(component) < LEAST, 0, component) for component in direction))
+        ray = mi.Ray3f(mi.Point3f(start), along)
         hit = scene.ray_intersect_preliminary(ray, coherent=mi.Bool(True), active=is_active)
         free = is_active & ~hit.is_valid() & (dr.dot(axis, direction) > 0)
         if self.limb is not None:
@@ -78,6 +79,5 @@ class SolarDirections:
     def _disc(self, points: Array, sun: Sun, limb: Limb | None) -> Disc:
         height = np.sqrt(1 - (points**2).sum(axis=1))
         rotated = np.column_stack([points, height]) @ axis_frame([0, 0, 0], sun.direction)[:3, :3].T
-        rotated[np.abs(rotated) < LEAST] = 0
         directions = backend.mitsuba().Vector3f(np.ascontiguousarray(rotated.T, np.float32))
         return Disc(len(points), directions, limb)

@@ -125,15 +125,21 @@ def test_no_ray_asks_for_shadow_where_a_closed_surface_faces_away():
     assert ((every.sun_cosine < 0) & (every.object_id > 0)).sum() > 100
     np.testing.assert_array_equal(every.radiance, fewer.radiance)
 
-    grey = material("lambertian-grey")
-    wrapped = replace(grey, bsdf={"type": "twosided", "bsdf": grey.bsdf})
-    inverted = trimesh.creation.box((2, 2, 2))
+    grey, inverted = material("lambertian-grey"), trimesh.creation.box((2, 2, 2))
     inverted.invert()
+    twosided = {"type": "twosided", "bsdf": grey.bsdf}
     sheet = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 2, 1], [0, 3, 2]], process=False)
-    for mesh, surface in ((sheet, grey), (inverted, wrapped)):
+    looks = [(sheet, grey.bsdf), (inverted, twosided), (inverted, {"type": "mask", "opacity": 0.9, "nested": twosided})]
+    for mesh, bsdf in looks:
         above = Camera.from_fov(look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), 8, 8, 5.0)
-        seen = Renderer(scene_of(mesh, surface), spp=2).render(above, Sun.from_angles(0, 90), seed=(1,))
+        lit = Renderer(scene_of(mesh, replace(grey, bsdf=bsdf)), spp=64)
+        seen = lit.render(above, Sun.from_angles(0, 90), seed=(1,))
         assert seen.radiance.min() * EXPOSURE > 0.1, "its normals point down"
+
+    ball = trimesh.creation.icosphere(2)
+    smooth = Part("ball", ball, grey, normals=ball.vertex_normals[ball.faces].reshape(-1, 3))
+    shaded = Renderer(Scene("smooth", (SceneObject(Spacecraft("smooth", (smooth,))),)), spp=1)
+    assert not shaded._loaded.sun.outside, "a shading normal may face the Sun where the surface does not"
 
 
 def test_inside_and_exposed():

@@ -170,8 +170,8 @@ def _classes() -> tuple[type, type]:
 
 
 def solar_disc(sun: SunConfig, earth: EarthConfig | None = None, outside: bool = False) -> Source:
-    """The Sun as a Mitsuba emitter; the Earth hides it where it is before it. outside: every surface is closed, and
-    reflects on its outside alone."""
+    """The Sun as a Mitsuba emitter; the Earth hides it where it is before it. outside: every surface is closed and
+    flat-shaded, and reflects on its outside alone."""
     return _classes()[0](sun, earth, outside)
 
 
