@@ -293,8 +293,9 @@ def box_projection(mesh: trimesh.Trimesh) -> Array:
 
 def _is_one_sided(bsdf: JsonMapping) -> bool:
     """Whether it reflects on the side of its normals alone, and lets nothing through."""
-    while bsdf["type"] == "normalmap":
-        bsdf = bsdf["bsdf"]
+    if bsdf["type"] == "normalmap":
+        below = [value for name, value in bsdf.items() if name != "normalmap" and isinstance(value, Mapping)]
+        return all(map(_is_one_sided, below))
     return bsdf["type"] in ONE_SIDED and "spec_trans" not in bsdf
 
 

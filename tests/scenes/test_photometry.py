@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from spacesim import backend
 from spacesim.data.geometry import direction_from_angles, look_at
 from spacesim.data.records import Camera, Sun
 from spacesim.data.store import SHADOW_SELF_CAST
@@ -16,6 +17,7 @@ from spacesim.scenes.lights.earth import EarthConfig
 from spacesim.scenes.lights.sun import EXPOSURE, SOLAR_IRRADIANCE, SunConfig
 from spacesim.scenes.materials.table import Material, material
 from spacesim.scenes.render import Renderer
+from spacesim.scenes.samples import path_sampler
 from spacesim.scenes.scene import Scene, SceneObject
 from spacesim.scenes.scenefile import read_scene
 from spacesim.scenes.spacecraft import Part, Spacecraft, spacecraft
@@ -93,6 +95,18 @@ def test_alpha_is_one_within_and_zero_away_from_the_labels_silhouette():
     assert truth.alpha[np.all(shifts, axis=0)].min() > 0.7  # a gap can be thinner than a pixel
     assert np.abs(truth.alpha.mean() - surface.mean()) < 0.005
     assert truth.alpha[~np.any(shifts, axis=0)].max() < 0.5  # and so can a boom
+
+
+def test_paths_have_the_random_numbers_of_mitsubas_independent_sampler():
+    mi = backend.mitsuba()
+    theirs, count = mi.load_dict({"type": "independent"}).fork(), 1000
+    theirs.seed(mi.UInt32(7), count)
+    chosen = np.arange(0, count, 3, dtype=np.uint32)
+    ours = path_sampler(mi.UInt32(7), mi.UInt32(chosen))
+    for _ in range(3):
+        for name in ("next_1d", "next_2d"):
+            expected, found = (np.array(getattr(sampler, name)()) for sampler in (theirs, ours))
+            np.testing.assert_array_equal(found, expected[..., chosen])
 
 
 def test_more_pixels_than_a_wavefront_holds(monkeypatch):
