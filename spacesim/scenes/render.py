@@ -184,8 +184,8 @@ def _trace_paths(
     noise: Noise,
     spp: int,
 ) -> Float:
-    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]. tiles: where there is something to see;
-    pixels: the others are not traced, None: none is left out"""
+    """Sums of RGB, then of alpha, over `spp` samples a pixel, [3 H W + H W]. pixels: those of `tiles`, which alone
+    are traced; None: each sample of the picture is asked whether it is within them"""
     mi = backend.mitsuba()
     size = view.width * view.height
     traced = size if pixels is None else dr.width(pixels)
@@ -199,7 +199,8 @@ def _trace_paths(
     x, y = view.directions(pixel, offset, distortion)
     ray, _ = view.rays_to(x, y)
     sampler = path_sampler(noise.paths, pixel * spp + sample)
-    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=tiles.may_show(view, x, y))
+    shown = tiles.may_show(view, x, y) if pixels is None else mi.Bool(True)
+    radiance, hit, _ = integrator.sample(scene, sampler, ray, active=shown)
     channels = [*radiance, dr.select(hit, mi.Float(1.0), mi.Float(0.0))]
     dr.eval(channels)
     *rgb, alpha = (dr.block_sum(x, spp, mode="evaluated") for x in channels)
