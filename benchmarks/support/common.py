@@ -19,7 +19,7 @@ import numpy as np
 
 from spacesim import backend
 from spacesim.backend import BackendError
-from spacesim.backend.launch import take_times
+from spacesim.backend.kernels.ptx import take_times
 from spacesim.data.errors import InputError, WorkError
 from spacesim.data.files import write_bytes
 from spacesim.data.geometry import fibonacci_sphere, look_at
@@ -240,7 +240,7 @@ def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP)
 
 @dataclass(frozen=True)
 class Kernels:
-    """What Dr.Jit's kernel history and `launch.take_times` say of a call: launches, milliseconds on the device (median
+    """What Dr.Jit's kernel history and `ptx.take_times` say of a call: launches, milliseconds on the device (median
     and least)."""
 
     launches: int

@@ -13,7 +13,7 @@ import numpy as np
 
 from spacesim.backend import ad, select
 from spacesim.backend.arrays import Float, TensorXf
-from spacesim.backend.launch import PtxKernel
+from spacesim.backend.kernels.ptx import PtxKernel
 from spacesim.backend.upload import upload
 from spacesim.learning.networks import warps
 from spacesim.learning.networks.network import ALIGNED, CHUNK, InputLayer, MlpShape, MlpTape

@@ -22,6 +22,7 @@ from spacesim.splat.raster.lists.pieces import count_pieces, read_pieces
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
 from spacesim.splat.raster.project import Splats
 from spacesim.splat.raster.records import ALPHA_MAX, LOG2_E, POWER_MIN, BlendState, exp2, exponents
+from spacesim.splat.raster.slot_sums import add_slots
 
 COPIES_BYTES = 2**30  #: that copies of gradient slots, one a CPU thread, may take
 PACKET = 4  #: SIMD lanes that run together on any CPU: Dr.Jit's packets have 4, 8 or 16, and start at a multiple
@@ -50,7 +51,6 @@ class SplatGradients:
     absolute_y: Float  #: the same of y
 
 
-@recorded
 def by_tiles(
     splats: Splats,
     state: BlendState,
@@ -59,6 +59,14 @@ def by_tiles(
     absolute: bool,
 ) -> SplatGradients:
     """See `blend.backward`. A thread for a block of a tile's pixels."""
+    return gather_slots(
+        _replay(state, lists, grad_planes, absolute), splats, lists, len(grad_planes.features), absolute
+    )
+
+
+@recorded(elements=lambda _, state, lists, grad_planes, absolute: grad_planes.width * grad_planes.height)
+def _replay(state: BlendState, lists: TileLists, grad_planes: PlaneGradients, absolute: bool) -> list[Float]:
+    """Sums of pairs, as `gather_slots` takes them."""
     channels, shape = len(grad_planes.features), lists.shape
     thread, offsets = thread_pixels(lists), thread_offsets(shape)
     transmittance, last, behind, gradients = [], [], [], []
@@ -118,7 +126,7 @@ def by_tiles(
     first = dr.gather(ad.UInt32, tile_last, thread.tile)
     dr.while_loop((first, transmittance, behind), remaining, replay, mode="symbolic", label="replay")
     dr.eval(slots)
-    return _gather_slots(slots, splats, lists, channels, absolute)
+    return slots
 
 
 class _PixelMoments:
@@ -340,13 +348,25 @@ def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
-def _gather_slots(
-    slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool
-) -> SplatGradients:
+def gather_slots(slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool) -> SplatGradients:
     """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
 
     slots: arrays [F P], F of a pair's sums side by side in each
     """
+    added = add_slots(slots, splats, lists, channels, absolute)
+    if added is None:
+        return _gather_slots(slots, splats, lists, channels, absolute)
+    none = cast(Float, None)  # nothing reads them
+    x, y, a, b, c, opacity, *rest = added
+    absolute_x, absolute_y = rest[channels:] or [none, none]
+    return SplatGradients(Splats(x, y, a, b, c, opacity, none), rest[:channels], absolute_x, absolute_y)
+
+
+@recorded(elements=lambda _, slots, splats, *_rest: dr.width(splats.x))
+def _gather_slots(
+    slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool
+) -> SplatGradients:
+    """`gather_slots` of Dr.Jit's."""
     splat = dr.arange(ad.UInt32, dr.width(splats.x))
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)

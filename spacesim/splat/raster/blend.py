@@ -15,6 +15,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, NumberT, UInt32
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.packet import store
 from spacesim.splat.raster.adjoint import PlaneGradients, SplatGradients, by_buckets, by_tiles
 from spacesim.splat.raster.lists.pieces import count_pieces, name_tiles
@@ -62,7 +63,6 @@ def _bucket(lists: TileLists, channels: int) -> int:
     return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
 
 
-@recorded(elements=lambda _, splats, features, lists, width, height, *_rest, **_named: width * height)
 def blend_lists(
     splats: Splats,
     features: list[Float],
@@ -72,17 +72,38 @@ def blend_lists(
     capacity: int,
     bucket: int | None = None,
 ) -> BlendResult:
-    """`forward` as a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket of the
-    adjoint, 0 for that by tiles, None where there is none"""
-    packed, size = pack_records(splats, features, capacity), (width, height)
+    """`forward`, which may be a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket
+    of the adjoint, 0 for that by tiles, None where there is none"""
+    size = width, height
+    if is_usable():  # records are copied between two recordings
+        records = list_records(_packed(splats, features, capacity), lists, capacity)
+        return _blend_records(records, len(features), lists, size, capacity, bucket)
+    return _blend_splats(splats, features, lists, size, capacity, bucket)
+
+
+_packed = recorded(pack_records)
+
+
+@recorded(elements=lambda _, splats, features, lists, size, *_rest: size[0] * size[1])
+def _blend_splats(
+    splats: Splats, features: list[Float], lists: TileLists, size: tuple[int, int], capacity: int, bucket: int | None
+) -> BlendResult:
+    records = list_records(pack_records(splats, features, capacity), lists, capacity)
+    return _blend_records(records, len(features), lists, size, capacity, bucket)
+
+
+@recorded(elements=lambda _, records, channels, lists, size, *_rest: size[0] * size[1])
+def _blend_records(
+    records: ListedRecords, channels: int, lists: TileLists, size: tuple[int, int], capacity: int, bucket: int | None
+) -> BlendResult:
     (transmittance, *sums), kept = blend_planes(
-        packed, len(features), lists, size, capacity, lambda passed, sums: [passed, *sums], bucket
+        records, channels, lists, size, capacity, lambda passed, sums: [passed, *sums], bucket
     )
     return BlendResult(sums, transmittance, kept)
 
 
 def blend_planes(
-    packed: list[Float],
+    records: ListedRecords,
     channels: int,
     lists: TileLists,
     image_size: tuple[int, int],
@@ -90,11 +111,10 @@ def blend_planes(
     finish: Finish,
     bucket: int | None = None,
 ) -> tuple[list[Float], BlendState | None]:
-    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. packed:
-    `pack_records` of so many channels"""
+    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. records:
+    of so many channels"""
     (width, height), shape = image_size, lists.shape
     assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
-    records = list_records(packed, lists, capacity)
     walks = whole_lists(lists, channels)
     if cut := are_in_parts(lists, capacity):
         walks = in_parts(lists, channels, lambda first: _walk(lists, records, first)[:2])

@@ -7,10 +7,11 @@ from typing import cast
 
 import drjit as dr
 
-from spacesim.backend import ad, select
+from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
 from spacesim.backend.blocks import new_block
 from spacesim.backend.packet import load, packets, store
+from spacesim.splat.raster.lists.record_copy import copy_records
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape
 from spacesim.splat.raster.project import ALPHA_MIN, Splats
 
@@ -83,10 +84,16 @@ def list_records(packed: list[Float], lists: TileLists, capacity: int) -> Listed
     dr.eval(packed)
     if capacity < IN_ORDER[select()]:
         return ListedRecords(packed, capacity)
+    copies = copy_records(packed, lists, capacity)
+    return ListedRecords(_ordered(packed, lists, capacity) if copies is None else copies, capacity)
+
+
+@recorded
+def _ordered(packed: list[Float], lists: TileLists, capacity: int) -> list[Float]:
     position = dr.arange(ad.UInt32, lists.capacity)
     ordered = [store(load([array], lists.splat, capacity), position, lists.capacity) for array in packed]
     dr.eval(ordered)
-    return ListedRecords(ordered, capacity)
+    return ordered
 
 
 def exponents(record: list[Float], px: Float, py: Float, shape: TileShape, blocks: bool = False) -> Iterator[Float]:

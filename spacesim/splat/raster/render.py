@@ -11,6 +11,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Array3f, ArrayXf, Bool, Float, UInt32, UInt64
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.readback import AsyncNumber, can_read_async
 from spacesim.backend.upload import held
 from spacesim.data.errors import InputError
@@ -26,7 +27,7 @@ from spacesim.splat.raster.lists.pictures import expected_capacity, observe
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.output import OUTPUTS, RenderOutput, over_alpha
 from spacesim.splat.raster.project import Footprints, Splats, project
-from spacesim.splat.raster.records import pack_records
+from spacesim.splat.raster.records import ListedRecords, list_records, pack_records
 from spacesim.splat.raster.surface import gather_or_zero, median_splat, normals, unit
 
 PLANES = {"color": 3, "depth": 1, "normal": 3}  #: that are blended for an output
@@ -132,7 +133,7 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
         if size[0] * size[1] >= MANY_PIXELS and can_read_async():
             listed = _list_splats(inputs, more, keeps_splats, *listing)
             number = AsyncNumber(listed.sums)
-            planes = _blend_records(listed.records, listed.lists, counts, size, most)
+            planes = _blend_records(list_records(listed.records, listed.lists, most), listed.lists, counts, size, most)
             pairs = number.wait()
         else:
             listed, planes = _draw_at_once(inputs, more, keeps_splats, counts, *listing)
@@ -147,8 +148,8 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
     observe(extent, pairs)
     if capacity == 0:
         return prepared.splats, *_draw_in_stages(prepared.splats, prepared.footprints, prepared.groups, camera)
-    limit = held(capacity, "pairs")
-    return prepared.splats, *_draw_boxes(prepared, counts, size, limit, extent.capacities(capacity), grid)
+    draw = _draw_boxes if is_usable() else _draw_boxes_at_once  # kernels of text stand between recordings
+    return prepared.splats, *draw(prepared, counts, size, held(capacity, "pairs"), extent.capacities(capacity), grid)
 
 
 @dataclass
@@ -203,7 +204,8 @@ def _draw_at_once(
     """`_list_splats`, and the planes."""
     listed = _list_splats(inputs, more, keeps_splats, count, limit, capacities, grid)
     size = inputs[1].width, inputs[1].height
-    return listed, _blend_records(listed.records, listed.lists, counts, size, capacities.splats)
+    records = list_records(listed.records, listed.lists, capacities.splats)
+    return listed, _blend_records(records, listed.lists, counts, size, capacities.splats)
 
 
 @recorded
@@ -215,7 +217,6 @@ def _prepare_boxes(inputs: Inputs, more: Planes, count: UInt32, capacity: int, g
     return _Prepared(splats, footprints, groups, records, make_boxes(splats, footprints, count, capacity, grid))
 
 
-@recorded(elements=lambda _, _prepared, _counts, size, *_rest: size[0] * size[1])
 def _draw_boxes(
     prepared: _Prepared,
     counts: Counts,
@@ -226,14 +227,18 @@ def _draw_boxes(
 ) -> tuple[TileLists, Planes]:
     """(the lists; planes)."""
     lists = make_lists(prepared.footprints, prepared.boxes, limit, capacities, grid)
-    return lists, _blend_records(prepared.records, lists, counts, size, capacities.splats)
+    records = list_records(prepared.records, lists, capacities.splats)
+    return lists, _blend_records(records, lists, counts, size, capacities.splats)
+
+
+_draw_boxes_at_once = recorded(_draw_boxes, elements=lambda _, _prepared, _counts, size, *_rest: size[0] * size[1])
 
 
 @recorded(elements=lambda _, _records, _lists, _counts, size, *_rest: size[0] * size[1])
 def _blend_records(
-    records: list[Float], lists: TileLists, counts: Counts, size: tuple[int, int], capacity: int
+    records: ListedRecords, lists: TileLists, counts: Counts, size: tuple[int, int], capacity: int
 ) -> Planes:
-    """Planes of `records`, `pack_records` of all that is blended, with this capacity."""
+    """Planes of `records` of all that is blended. capacity: of the splats"""
 
     def finish(transmittance: Float, sums: list[Float]) -> list[Float]:
         return _features(_finish(sums, transmittance, counts))

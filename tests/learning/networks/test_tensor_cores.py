@@ -6,7 +6,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from spacesim.backend import ad, launch, select
+from spacesim.backend import ad, select
+from spacesim.backend.kernels import ptx
 from spacesim.backend.upload import upload
 from spacesim.learning.networks import product_text, tensor_cores
 from spacesim.learning.networks.network import CHUNK, MlpShape
@@ -98,12 +99,12 @@ def test_what_is_not_finite_is_not_taken_for_zero(value):
 @pytest.mark.usefixtures("_cuda")
 def test_products_repeat_to_the_bit_and_are_timed_when_that_is_asked_for():
     gradient, items = tensor(case(70, 256, CHUNK)), tensor(case(70, 156, CHUNK))
-    launch.take_times()
+    ptx.take_times()
     first = np.array(tensor_cores._outer(gradient, items))
-    assert launch.take_times() == []
+    assert ptx.take_times() == []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         again = [np.array(tensor_cores._outer(gradient, items)) for _ in range(5)]
-    times = launch.take_times()
+    times = ptx.take_times()
     assert len(times) == 5
     assert all(0 < time < 100 for time in times)
     assert all(other.tobytes() == first.tobytes() for other in again)
@@ -112,7 +113,7 @@ def test_products_repeat_to_the_bit_and_are_timed_when_that_is_asked_for():
 @pytest.mark.usefixtures("_cuda")
 def test_text_that_the_driver_does_not_take_is_named():
     with pytest.raises(RuntimeError, match="cuModuleLoadData failed"):
-        launch.PtxKernel("no text", "entry", 1, 1, 0, 32)
+        ptx.PtxKernel("no text", "entry", 1, 1, 0, 32)
 
 
 def test_wide_networks_of_few_outputs_take_them_where_kernels_can_be_launched(monkeypatch):

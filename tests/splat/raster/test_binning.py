@@ -8,6 +8,7 @@ import pytest
 from splats import random_splats
 
 from spacesim.backend import ad, recorded, recordings, select
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.readback import AsyncNumber
 from spacesim.backend.upload import held, upload
 from spacesim.data.geometry import look_at
@@ -21,7 +22,7 @@ from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Pinhole, Splats, project
 
 pytestmark = pytest.mark.threads
-WAYS = ("cuda", "llvm")
+WAYS = ("cuda", "llvm", "llvm-drjit")  # the last without kernels of text
 
 
 @pytest.fixture(params=WAYS)
@@ -31,10 +32,12 @@ def way(request, monkeypatch):
 
 
 def use(name, monkeypatch):
-    if name == "llvm" and select() == "cuda":
+    backend = name.split("-")[0]
+    if backend == "llvm" and select() == "cuda":
         pytest.skip("Dr.Jit cannot replay its sort on CUDA")
     for module in (binning, tiles):
-        monkeypatch.setattr(module, "select", lambda: name)
+        monkeypatch.setattr(module, "select", lambda: backend)
+    monkeypatch.setattr(binning, "is_usable", is_usable if name == "llvm" else lambda: False)
 
 
 def projected(count: int, width: int, height: int, seed: int = 0) -> tuple[Splats, Footprints]:
@@ -88,7 +91,8 @@ def test_slots_are_the_splats_own(way):
     lists = binning.bin_splats(splats, footprints, 70, 50)
     start, end = np.array(lists.start), np.array(lists.end)
     entries = np.concatenate([np.arange(s, e) for s, e in zip(start, end, strict=True)])
-    splat, slot = np.array(lists.splat)[entries], np.array(lists.slot)[entries]
+    slots = np.array(lists.slot) if lists.place is None else np.argsort(np.array(lists.place)).astype(np.uint32)
+    splat, slot = np.array(lists.splat)[entries], slots[entries]
     first, count = np.array(lists.first_slot)[splat], np.array(lists.slot_count)[splat]
     assert (slot >= first).all()
     assert (slot < first + count).all()
@@ -107,7 +111,7 @@ def test_both_ways_list_the_same(count, size, monkeypatch):
     for name in WAYS:
         use(name, monkeypatch)
         found.append(listed(binning.bin_splats(splats, footprints, *size)))
-    assert found[0] == found[1]
+    assert found[0] == found[1] == found[2]
     assert sum(map(len, found[0])) > count / 2
 
 
@@ -318,8 +322,9 @@ def test_pairs_are_numbered_in_few_bits_where_they_fit(way):
 def test_tiles_are_dealt_longest_first(lengths):
     """Each tile once; those that share a packet have lists of about one length; runs of tiles have long and short."""
     lengths = np.random.default_rng(0).permutation(lengths)
-    shape = tiles.TileShape(8, 8, 4, 2)
-    order = np.array(binning._longest_first(upload(lengths.astype(np.uint32), ad.UInt32), shape))
+    grid, ends = boxes.Grid(len(lengths), 1, tiles.TileShape(8, 8, 4, 2)), np.cumsum(lengths)
+    start, end = (upload(bounds.astype(np.uint32), ad.UInt32) for bounds in (ends - lengths, ends))
+    order = np.array(binning._longest_first(start, end, grid))
     assert sorted(order.tolist()) == list(range(len(lengths)))
     dealt = np.minimum(lengths, binning.MAX_SORTED_LENGTH)[order]
     ranks = np.sort(np.minimum(lengths, binning.MAX_SORTED_LENGTH))[::-1]

@@ -9,6 +9,7 @@ in no list. How the lists are put in order depends on the backend, the order doe
 - LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
 """
 
+from dataclasses import dataclass
 from math import gcd
 from typing import Any
 
@@ -16,13 +17,15 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import UInt32
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.packet import load
 from spacesim.backend.upload import held
 from spacesim.splat.raster.lists.boxes import Boxes, Grid, find_boxes, packed, tile_of_pair
 from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent
 from spacesim.splat.raster.lists.counting import count_boxes, count_lists
+from spacesim.splat.raster.lists.pair_sort import sort_pairs
 from spacesim.splat.raster.lists.sort import segment_ids
-from spacesim.splat.raster.lists.tiles import TileLists, TileShape
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats
 
 DIGIT_BITS = 11  #: at most, of the radix sort; the fewest passes whose counters stay small
@@ -63,7 +66,13 @@ def make_lists(footprints: Footprints, boxes: Boxes, limit: UInt32, capacities: 
     the capacity on the device."""
     if select() == "cuda":
         return count_lists(footprints, boxes, limit, capacities, grid)
-    return _expand(boxes, limit, capacities, grid)
+    if not is_usable():
+        return _sort(boxes, limit, capacities, grid)
+    pairs = _expand(boxes, limit, capacities, grid)
+    start, end, splat, place = sort_pairs(pairs.tile, pairs.splat, grid.tiles)
+    bounds = start, end, pairs.first_slot, pairs.slot_count
+    tiles, order = (grid.columns, grid.rows, grid.shape), _longest_first(start, end, grid)
+    return TileLists(splat, None, *bounds, capacities.pairs, *tiles, order, place)
 
 
 def _detached(splats: Splats) -> Splats:
@@ -89,9 +98,19 @@ def _rank(splats: Splats, footprints: Footprints, count: UInt32, capacity: int, 
     return Boxes(records, pairs, count, dr.prefix_reduce(dr.ReduceOp.Add, wide, exclusive=False), order)
 
 
+@dataclass
+class _Pairs:
+    """Of tile and splat, splat by splat."""
+
+    tile: UInt32  #: [P], the number of tiles of those in no list
+    splat: UInt32  #: [P]
+    first_slot: UInt32  #: of each splat's pairs [M]
+    slot_count: UInt32  #: [M]
+
+
 @recorded
-def _expand(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> TileLists:
-    """Lists from two stable sorts."""
+def _expand(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> _Pairs:
+    """The pairs of boxes; none where there are more than `limit`."""
     capacity, splat_capacity = capacities.pairs, capacities.splats
     # Mark each splat's first pair with its rank, then a running maximum fills in the rest.
     splat_rank = dr.arange(ad.UInt32, splat_capacity)
@@ -112,32 +131,38 @@ def _expand(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> 
     within = slot - dr.gather(ad.UInt32, first, rank)
     ellipse = load(boxes.records, splat, splat_capacity)
     tile = tile_of_pair(ellipse, within, slot < total, grid)
-    dr.eval(tile, splat)
-    count = grid.tiles
-    slot = _stable_order(tile, count.bit_length())
-    splat = dr.gather(ad.UInt32, splat, slot)
-    number = dr.arange(ad.UInt32, count)
-    end = segment_ids(tile, number, capacity, slot)
+    dr.eval(tile, splat, first_slot)
+    return _Pairs(tile, splat, first_slot, slot_count)
+
+
+@recorded
+def _sort(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> TileLists:
+    """Lists from a stable sort by tiles."""
+    pairs, capacity, count = _expand(boxes, limit, capacities, grid), capacities.pairs, grid.tiles
+    slot = _stable_order(pairs.tile, count.bit_length())
+    splat = dr.gather(ad.UInt32, pairs.splat, slot)
+    end = segment_ids(pairs.tile, dr.arange(ad.UInt32, count), capacity, slot)
     dr.eval(end)
-    start = dr.gather(ad.UInt32, end, number - 1, number > 0)
-    order = _longest_first(end - start, grid.shape)
+    start = dr.gather(ad.UInt32, end, dr.arange(ad.UInt32, count) - 1, dr.arange(ad.UInt32, count) > 0)
+    order = _longest_first(start, end, grid)
     place = dr.empty(ad.UInt32, capacity)
     dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
-    dr.eval(splat, slot, start, end, first_slot, order, place)
-    return TileLists(
-        splat, slot, start, end, first_slot, slot_count, capacity, grid.columns, grid.rows, grid.shape, order, place
-    )
+    dr.eval(splat, start, end, order, place)
+    bounds, tiles = (start, end, pairs.first_slot, pairs.slot_count), (grid.columns, grid.rows, grid.shape)
+    return TileLists(splat, None, *bounds, capacity, *tiles, order, place)
 
 
-def _longest_first(length: UInt32, shape: TileShape) -> UInt32:
-    """Tiles by the lengths [T] of their lists, longest first, in packets that are then spread by the golden ratio.
+@recorded
+def _longest_first(start: UInt32, end: UInt32, grid: Grid) -> UInt32:
+    """Tiles by the lengths of their lists, from `start` to `end` [T], longest first, in packets that are then spread by
+    the golden ratio.
 
     Tiles that share a packet are walked together until the longest list ends: neighbours are of about one length.
     CPU threads take runs of packets: each run, of whatever length, has long lists and short ones alike.
     """
-    count = dr.width(length)
+    count, length = grid.tiles, end - start
     sorted_ = _stable_order(MAX_SORTED_LENGTH - dr.minimum(length, MAX_SORTED_LENGTH), MAX_SORTED_LENGTH.bit_length())
-    group = max(PACKET // shape.threads, 1)
+    group = max(PACKET // grid.shape.threads, 1)
     groups = count // group
     stride = _golden_stride(groups)
     if stride < 2:

@@ -46,8 +46,8 @@ class TileLists:
     """(tile, splat) pairs. `splat`, `slot` [P] are in blending order; `start`, `end` [T] delimit each tile.
 
     Slots number the pairs splat by splat: those of splat i are `first_slot[i]` .. + `slot_count[i]`, [M], on CUDA [N];
-    lists for a picture alone have none. Arrays are longer than there are pairs and splats, so that few sizes occur: P
-    is `capacity`, M at least N.
+    lists for a picture alone have none. `slot` is None where `place` is there. Arrays are longer than there are pairs
+    and splats, so that few sizes occur: P is `capacity`, M at least N.
     """
 
     splat: UInt32
