@@ -55,8 +55,16 @@ def test_numbers_are_rounded_as_float32():
     def write(text: Text) -> None:
         pair = text.load_floats("values", text.integer(0), 2)
         x, y = pair.entry(0), pair.entry(1)
-        results = [x + y, x - y, x * y, x / y, text.fma(x, y, text.float(-0.1)), text.largest(x, y), text.largest(y, x)]
-        for i, result in enumerate([*results, text.float(1 / 3)]):
+        results = [
+            x + y,
+            x - y,
+            x * y,
+            x / y,
+            text.fma(x, y, text.one_float(-0.1)),
+            text.largest(x, y),
+            text.largest(y, x),
+        ]
+        for i, result in enumerate([*results, text.one_float(1 / 3)]):
             text.store("results", text.integer(i), result)
         text.store("results", text.integer(8), pair + pair)
 

@@ -29,6 +29,20 @@ class Value:
     def __truediv__(self, other: "Value") -> "Value":
         return self._with("div", other)
 
+    def __floordiv__(self, other: "Value") -> "Value":
+        return self.text.value(INT, f"udiv {INT} {self.name}, {other.name}")
+
+    def __mod__(self, other: "Value") -> "Value":
+        return self.text.value(INT, f"urem {INT} {self.name}, {other.name}")
+
+    def __lt__(self, other: "Value") -> "Value":
+        operation, entry = ("icmp ult", INT) if self.kind == INT else ("fcmp olt", FLOAT)
+        return self.text.value(self.kind.replace(entry, "i1"), f"{operation} {self.kind} {self.name}, {other.name}")
+
+    def choose(self, yes: "Value", no: "Value") -> "Value":
+        """Of a condition, or one for each entry of a vector."""
+        return self.text.value(yes.kind, f"select {self.kind} {self.name}, {yes.kind} {yes.name}, {no.kind} {no.name}")
+
     def _with(self, operation: str, other: "Value | int") -> "Value":
         second = other.name if isinstance(other, Value) else str(other)
         prefix = "" if self.kind == INT else "f"
@@ -56,6 +70,13 @@ class Text:
         self._addresses = {name: self._parameter("ptr", FIRST + i) for i, name in enumerate(arrays)}
         self._numbers = {name: self._parameter(INT, FIRST + len(arrays) + i) for i, name in enumerate(numbers)}
 
+    def first_of(self, names: Sequence[str], index: Value, name: str) -> None:
+        """Give a name to one of several arrays."""
+        address = self._addresses[names[-1]]
+        for place in reversed(range(len(names) - 1)):
+            address = (index < self.integer(place + 1)).choose(self._addresses[names[place]], address)
+        self._addresses[name] = address
+
     def _parameter(self, kind: str, place: int) -> Value:
         where = self.value("ptr", f"getelementptr i64, ptr %parameters, i64 {place}")
         return self.value(kind, f"load {kind}, ptr {where.name}")
@@ -63,6 +84,11 @@ class Text:
     def number(self, name: str) -> Value:
         """One that the kernel is launched with."""
         return self._numbers[name]
+
+    def float_number(self, name: str) -> Value:
+        """One that the kernel is launched with, of `float_bits`."""
+        bits = self.value("i32", f"trunc {INT} {self._numbers[name].name} to i32")
+        return self.value(FLOAT, f"bitcast i32 {bits.name} to float")
 
     def value(self, kind: str, instruction: str) -> Value:
         """Result of an instruction."""
@@ -79,14 +105,29 @@ class Text:
         """A constant."""
         return Value(self, INT, str(number))
 
-    def float(self, number: float) -> Value:
+    def one_float(self, number: float) -> Value:
         """A constant float32."""
-        rounded = struct.unpack("<f", struct.pack("<f", number))[0]
-        return Value(self, FLOAT, f"0x{struct.unpack('<Q', struct.pack('<d', rounded))[0]:016X}")
+        return Value(self, FLOAT, _constant(number))
+
+    def floats(self, size: int, number: float) -> Value:
+        """A constant vector of one float32."""
+        return Value(self, vector(size), f"<{', '.join([f'float {_constant(number)}'] * size)}>")
+
+    def spread(self, number: Value, size: int) -> Value:
+        """A vector of one float32."""
+        kind = vector(size)
+        first = self.value(kind, f"insertelement {kind} poison, float {number.name}, i32 0")
+        zeros = f"<{size} x i32> zeroinitializer"
+        return self.value(kind, f"shufflevector {kind} {first.name}, {kind} poison, {zeros}")
 
     def zeros(self, size: int) -> Value:
         """A vector of float32."""
         return Value(self, vector(size), "zeroinitializer")
+
+    def lanes(self, size: int, first: Value, end: Value) -> Value:
+        """Of a vector whose first entry has a number, whether each is below another."""
+        call = f"@llvm.get.active.lane.mask.v{size}i1.i64(i64 {first.name}, i64 {end.name})"
+        return self.value(f"<{size} x i1>", f"call <{size} x i1> {call}")
 
     def load(self, array: str, index: Value) -> Value:
         """An unsigned integer of 32 bits."""
@@ -97,6 +138,18 @@ class Text:
         """A float32, or a vector of `size` numbers from entry `index` on."""
         kind = vector(size) if size else FLOAT
         return self.value(kind, f"load {kind}, ptr {self._place(array, index, FLOAT)}, align 4")
+
+    def load_lanes(self, array: str, index: Value, lanes: Value) -> Value:
+        """A vector of float32 from entry `index` on, 0 but for `lanes`, the others of which need not be there."""
+        kind = lanes.kind.replace("i1", FLOAT)
+        arguments = f"ptr {self._place(array, index, FLOAT)}, i32 4, {lanes.kind} {lanes.name}, {kind} zeroinitializer"
+        return self.value(kind, f"call {kind} @llvm.masked.load.v{_size(kind)}f32.p0({arguments})")
+
+    def store_lanes(self, array: str, index: Value, value: Value, lanes: Value) -> None:
+        """Write entries of a vector, those of `lanes`."""
+        place, kind = self._place(array, index, FLOAT), value.kind
+        arguments = f"{kind} {value.name}, ptr {place}, i32 4, {lanes.kind} {lanes.name}"
+        self.do(f"call void @llvm.masked.store.v{_size(kind)}f32.p0({arguments})")
 
     def store(self, array: str, index: Value, value: Value) -> None:
         """Write a number, integers in 32 bits, or a vector from entry `index` on."""
@@ -115,7 +168,14 @@ class Text:
 
     def fma(self, x: Value, y: Value, z: Value) -> Value:
         """x y + z, rounded once."""
-        return self.value(FLOAT, f"call float @llvm.fma.f32(float {x.name}, float {y.name}, float {z.name})")
+        name = f"v{_size(x.kind)}f32" if x.kind != FLOAT else "f32"
+        arguments = ", ".join(f"{value.kind} {value.name}" for value in (x, y, z))
+        return self.value(x.kind, f"call {x.kind} @llvm.fma.{name}({arguments})")
+
+    def sum(self, value: Value) -> Value:
+        """Of a vector's entries, the first first."""
+        call = f"@llvm.vector.reduce.fadd.v{_size(value.kind)}f32(float {_constant(-0.0)}, {value.kind} {value.name})"
+        return self.value(FLOAT, f"call float {call}")
 
     def largest(self, x: Value, y: Value) -> Value:
         """The larger of two float32; the second where one is no number."""
@@ -123,8 +183,8 @@ class Text:
         return self.value(FLOAT, f"select i1 {is_larger.name}, float {x.name}, float {y.name}")
 
     @contextmanager
-    def loop(self, start: Value, end: Value, state: Sequence[Value] = ()) -> Iterator["Loop"]:
-        """What is written within is done for integers from `start` to `end` - 1."""
+    def loop(self, start: Value, end: Value, state: Sequence[Value] = (), step: Value | int = 1) -> Iterator["Loop"]:
+        """What is written within is done for integers from `start` to `end` - 1, every one or each `step`."""
         self._count += 1
         name, before = f"loop{self._count}", self._block
         self.do(f"br label %{name}")
@@ -137,7 +197,7 @@ class Text:
         self.do(f"br i1 %{name}.more, label %{name}.body, label %{name}.end")
         self._begin(f"{name}.body")
         yield loop
-        following = loop.at + 1
+        following = loop.at + step
         firsts, nexts = [start, *state], [following, *loop.following]
         assert len(firsts) == len(nexts), "a loop says what its state becomes"
         self._lines[place:place] = [
@@ -170,8 +230,29 @@ def vector(size: int) -> str:
     return f"<{size} x float>"
 
 
+def _size(kind: str) -> int:
+    """Of a vector."""
+    return int(kind[1:].split()[0])
+
+
+def float_bits(number: float) -> int:
+    """A float32 as kernels are launched with it."""
+    return int(struct.unpack("<I", struct.pack("<f", number))[0])
+
+
+def _constant(number: float) -> str:
+    """Of float32, as LLVM reads it: the bits of the float64 that is equal."""
+    rounded = struct.unpack("<f", struct.pack("<f", number))[0]
+    return f"0x{struct.unpack('<Q', struct.pack('<d', rounded))[0]:016X}"
+
+
 DECLARED = """
 declare i64 @llvm.umin.i64(i64, i64)
 declare void @llvm.prefetch.p0(ptr, i32, i32, i32)
 declare float @llvm.fma.f32(float, float, float)
+declare <16 x float> @llvm.fma.v16f32(<16 x float>, <16 x float>, <16 x float>)
+declare float @llvm.vector.reduce.fadd.v16f32(float, <16 x float>)
+declare <16 x i1> @llvm.get.active.lane.mask.v16i1.i64(i64, i64)
+declare <16 x float> @llvm.masked.load.v16f32.p0(ptr, i32, <16 x i1>, <16 x float>)
+declare void @llvm.masked.store.v16f32.p0(<16 x float>, ptr, i32, <16 x i1>)
 """

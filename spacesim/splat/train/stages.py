@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from spacesim.backend import ad, select
-from spacesim.backend.arrays import Bool, Float, UInt32, UInt64
+from spacesim.backend.arrays import Array3f, Bool, Float, UInt32, UInt64
 from spacesim.backend.packet import numbers_at
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
@@ -183,15 +183,28 @@ class LossSettings:
     downscale: int = 1  #: pixels of the target on a side of each pixel that is compared
 
 
-def picture_loss(
+@dataclass
+class _Compared:
+    """A picture and its target at the pixels that are compared."""
+
+    picture: Array3f  #: over the target's background, with its curve
+    truth: Array3f  #: likewise
+    planes: dict[str, list[Float]]  #: what was blended
+    transmittance: Float  #: plane
+    valid: Bool  #: pixels that count
+    truths: TruthPlanes  #: of `TargetImage.truth`
+    size: tuple[int, int]  #: width and height
+
+
+def _compare(
     planes: dict[str, list[Float]],
     transmittance: Float,
+    gains: Float | None,
     target: TargetImage,
     size: tuple[int, int],
     config: LossSettings,
-) -> tuple[Float, dict[str, list[Float]], Float]:
-    """Loss of a picture over the target's background, and its gradients by its planes (by name), with those by "gains"
-    where the target has some, and transmittance. size: width and height of the target, pixels, before downscaling"""
+) -> _Compared:
+    """See `picture_loss`."""
     times = config.downscale
     covered, alpha = covered_color(target.rgba, size, times, config.tone, light=config.supersample > 1)
     valid, truths = valid_squares(target.valid, size, times), truth_of_squares(target.truth, size, times)
@@ -204,11 +217,6 @@ def picture_loss(
     if config.tone:
         dr.eval(below)  # three numbers, which each pixel would compute
     truth = covered + (1 - alpha) * below
-    planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
-    transmittance = ad.Float(transmittance)
-    gains = None if target.gains is None else ad.Float(target.gains)
-    dr.enable_grad(planes, transmittance, gains)
-    inputs, input_transmittance = planes, transmittance
     if config.supersample > 1:
         planes, transmittance = pixel_means(planes, transmittance, size, config.supersample, config.tone is not None)
     color = ad.Array3f(planes["color"])
@@ -219,23 +227,66 @@ def picture_loss(
         picture, truth = encode_radiance(picture), encode_radiance(truth)
     elif config.tone:
         picture, truth = tone_map(picture, config.tone), tone_map(truth, config.tone)
-    loss = photometric_loss(picture, truth, *size, ssim_weight=config.ssim)
-    if "visibility" in planes:
-        loss += config.visibility * visibility_loss(planes["visibility"][0], truths["visibility"][0], valid)
-    if "depth" in planes:
+    return _Compared(picture, truth, planes, transmittance, valid, truths, size)
+
+
+def compared_pictures(
+    planes: dict[str, list[Float]],
+    transmittance: Float,
+    target: TargetImage,
+    size: tuple[int, int],
+    config: LossSettings,
+) -> tuple[Array3f, Array3f]:
+    """(picture, truth), as `picture_loss` compares them."""
+    compared = _compare({"color": planes["color"]}, transmittance, target.gains, target, size, config)
+    return compared.picture, compared.truth
+
+
+def picture_loss(
+    planes: dict[str, list[Float]],
+    transmittance: Float,
+    target: TargetImage,
+    size: tuple[int, int],
+    config: LossSettings,
+    known: tuple[Float, Array3f] | None = None,
+) -> tuple[Float, dict[str, list[Float]], Float]:
+    """Loss of a picture over the target's background, and its gradients by its planes (by name), with those by "gains"
+    where the target has some, and transmittance. size: width and height of the target, pixels, before downscaling;
+    known: the photometric term of `compared_pictures`, and its gradient, if they are"""
+    planes = {name: [ad.Float(plane) for plane in group] for name, group in planes.items()}
+    transmittance = ad.Float(transmittance)
+    gains = None if target.gains is None else ad.Float(target.gains)
+    dr.enable_grad(planes, transmittance, gains)
+    compared = _compare(planes, transmittance, gains, target, size, config)
+    valid, truths, shown = compared.valid, compared.truths, compared.planes
+    terms = []
+    if "visibility" in shown:
+        terms.append(config.visibility * visibility_loss(shown["visibility"][0], truths["visibility"][0], valid))
+    if "depth" in shown:
         depth = truths["depth"][0] / config.scale
-        loss += config.depth * depth_loss(planes["depth"][0], transmittance, depth, valid)
-    if "normal" in planes:
-        normal = ad.Array3f(planes["normal"]), transmittance, ad.Array3f(truths["normal"])
-        loss += config.normal * normal_loss(*normal, valid)
+        terms.append(config.depth * depth_loss(shown["depth"][0], compared.transmittance, depth, valid))
+    if "normal" in shown:
+        normal = ad.Array3f(shown["normal"]), compared.transmittance, ad.Array3f(truths["normal"])
+        terms.append(config.normal * normal_loss(*normal, valid))
     if "foreground" in truths:
         mask, weight = truths["foreground"]
-        loss += weight * foreground_loss(transmittance, mask)
-    dr.backward(loss)
-    grad_planes = {name: [dr.grad(plane) for plane in group] for name, group in inputs.items()}
+        terms.append(weight * foreground_loss(compared.transmittance, mask))
+    if known is None:
+        loss = photometric_loss(compared.picture, compared.truth, *compared.size, ssim_weight=config.ssim)
+        value = dr.detach(loss)
+    else:
+        sums, gradient = known
+        loss, value = dr.sum(compared.picture * gradient), dr.sum(sums)  # the first, of each pixel, has that gradient
+    for term in terms:
+        value += dr.detach(term)
+    for root in (loss, *terms):
+        dr.set_grad(root, 1)
+        dr.enqueue(dr.ADMode.Backward, root)
+    dr.traverse(dr.ADMode.Backward)
+    grad_planes = {name: [dr.grad(plane) for plane in group] for name, group in planes.items()}
     if gains is not None:
         grad_planes["gains"] = [dr.grad(gains)]
-    return dr.detach(loss), grad_planes, dr.grad(input_transmittance)
+    return value, grad_planes, dr.grad(transmittance)
 
 
 NetworkStep = tuple[list[Float], tuple[list[Float], list[Float]], list[list[Float]], Float]

@@ -12,6 +12,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Float
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.upload import held, upload_numbers
 from spacesim.data.records import Camera
 from spacesim.splat.light.model import LightModel, Shading
@@ -28,6 +29,7 @@ from spacesim.splat.raster.seen import shown_splats
 from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.train.async_lists import TrainingPairs, ViewPairs
 from spacesim.splat.train.config import TrainConfig
+from spacesim.splat.train.loss.strips import loss_and_gradient
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
     BlendTape,
@@ -36,6 +38,7 @@ from spacesim.splat.train.stages import (
     ViewRequest,
     ViewSplats,
     blend_view,
+    compared_pictures,
     draw_view,
     find_view_boxes,
     list_view,
@@ -129,7 +132,7 @@ class ViewPass:
         self._loss_settings = {downscale: replace(terms, downscale=downscale) for downscale in factors}
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
         self._draw = recorded(draw_view, elements=_elements)
-        self._loss = recorded(picture_loss)
+        self._pictures, self._loss = recorded(compared_pictures), recorded(picture_loss)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._hidden = _hidden_weight(config)
         self._screen_sizes: dict[tuple[int, int, int], Float] = {}  # by width, height, number of the view in its step
@@ -199,7 +202,13 @@ class ViewPass:
         blended = drawn.tape.blended
         planes, size = _group_by_name(blended.features, drawn.channels), (camera.width, camera.height)
         terms = self._loss_settings[drawn.downscale]
-        value, grad_planes, grad_transmittance = self._loss(planes, blended.transmittance, target, size, terms)
+        shown = planes, blended.transmittance, target, size, terms
+        known = None
+        if terms.ssim > 0 and is_usable():
+            picture, truth = self._pictures(*shown)
+            width, height = (extent // terms.downscale for extent in size)
+            known = loss_and_gradient(picture, truth, width, height, terms.ssim)
+        value, grad_planes, grad_transmittance = self._loss(*shown, known)
         grad_gains = grad_planes.pop("gains", [None])[0]
         in_order = [plane for group in grad_planes.values() for plane in group]
         return ViewLoss(value, in_order, grad_transmittance, grad_gains)

@@ -1,31 +1,25 @@
 """L1 and structural dissimilarity of pictures (thesis 2.8; SSIM of Wang et al. 2004) with their derivative by hand.
 
-The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. Three kernels follow that which
-writes the pictures: moments blurred along rows; those blurred along columns, SSIM, its derivatives by the moments, and
-these blurred along columns; those blurred along rows, and the gradient.
+The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. On a CPU `strips` does all of
+it; else, and within recordings, three kernels follow that which writes the pictures: moments blurred along rows; those
+blurred along columns, SSIM, its derivatives by the moments, and these blurred along columns; those blurred along rows,
+and the gradient.
 """
 
 from collections.abc import Sequence
 from typing import cast
 
 import drjit as dr
-import numpy as np
 
-from spacesim.backend import ad, select
+from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.blocks import new_block
+from spacesim.backend.kernels.llvm import is_usable
+from spacesim.splat.train.loss.strips import loss_and_gradient
+from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
 
-RADIUS = 5  #: 11 x 11 window
-SIGMA = 1.5  #: pixels
-COLUMNS = {"cuda": 4, "llvm": 8}  #: pixels of a row that a thread computes
+COLUMNS = 4  #: pixels of a row that a thread computes
 ROWS = 16  #: pixels of a column that a thread computes
-#: backends on which the moments of a pixel stand side by side, elsewhere in planes: two cores take 1.3 times as long
-#: with planes, an H100 1.25 times as long with packets
-PACKED = ("llvm",)
-_C1, _C2 = 0.01**2, 0.03**2
-_OFFSETS = np.arange(-RADIUS, RADIUS + 1)
-_WEIGHTS = np.exp(-0.5 * (_OFFSETS / SIGMA) ** 2)
-WINDOW: list[float] = (_WEIGHTS / _WEIGHTS.sum()).tolist()
 
 
 def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float = 0.2) -> Float:
@@ -41,6 +35,10 @@ def photometric_loss(prediction: Array3f, target: Array3f, width: int, height: i
 
 class _Photometric(dr.CustomOp):
     def eval(self, prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float) -> Float:
+        self.gradient: Array3f | None = None
+        if is_usable():
+            sums, self.gradient = loss_and_gradient(prediction, target, width, height, ssim_weight)
+            return dr.sum(sums)
         self.strips = strips = _Strips(width, height)
         self.l1, self.ssim = ((share / (3 * width * height)) for share in (1 - ssim_weight, ssim_weight))
         dr.eval(prediction, target)
@@ -54,7 +52,11 @@ class _Photometric(dr.CustomOp):
         return dr.sum(loss)
 
     def backward(self) -> None:
-        strips, scale = self.strips, cast(Float, self.grad_out())
+        scale = cast(Float, self.grad_out())
+        if self.gradient is not None:
+            self.set_grad_in("prediction", scale * self.gradient)
+            return
+        strips = self.strips
         l1, ssim = scale * self.l1, scale * self.ssim
         thread = dr.arange(ad.UInt32, strips.height * strips.across)
         row, strip = thread // strips.across, thread % strips.across
@@ -82,20 +84,16 @@ def _moments(strips: "_Strips", pairs: list[tuple[Float, Float]]) -> tuple[list[
     count = strips.height * strips.across
     thread = dr.arange(ad.UInt32, count)
     row, strip = thread // strips.across, thread % strips.across
-    packed = select() in PACKED
-    size, numbers = 3 * strips.height * strips.stride, 4 if packed else 1
-    moments, distances = [dr.empty(ad.Float, numbers * size) for _ in range(4 // numbers)], ad.Float(0)
+    moments = [dr.empty(ad.Float, 3 * strips.height * strips.stride) for _ in range(4)]
+    distances = ad.Float(0)
     for channel, pair in enumerate(pairs):
         xs, ys = (strips.read_row(plane, row, strip, RADIUS) for plane in pair)
-        for j in range(RADIUS, RADIUS + strips.columns):
+        for j in range(RADIUS, RADIUS + COLUMNS):
             distances += dr.abs(xs[j] - ys[j])
         squares = [dr.fma(x, x, y * y) for x, y in zip(xs, ys, strict=True)]
         products = [x * y for x, y in zip(xs, ys, strict=True)]
-        packets = [_blur(values) for values in (xs, ys, squares, products)]
-        if packed:
-            packets = [[value for values in _transposed(packets) for value in values]]
-        for array, packet in zip(moments, packets, strict=True):
-            dr.scatter(array, ad.ArrayXf(packet), channel * count + thread, mode=dr.ReduceMode.NoConflicts)
+        for array, values in zip(moments, (xs, ys, squares, products), strict=True):
+            dr.scatter(array, ad.ArrayXf(_blur(values)), channel * count + thread, mode=dr.ReduceMode.NoConflicts)
     return moments, distances
 
 
@@ -126,8 +124,8 @@ def _similarity(means: Sequence[Float], inside: Bool) -> tuple[Float, Float, Flo
     x^2 and x y (the first with the window's other means held); all 0 where not `inside`."""
     mx, my, squares, product = means
     mxy, mm = mx * my, dr.fma(mx, mx, my * my)
-    a1, a2 = 2 * mxy + _C1, 2 * (product - mxy) + _C2
-    r1, r2 = dr.rcp(mm + _C1), dr.rcp(squares - mm + _C2)
+    a1, a2 = 2 * mxy + C1, 2 * (product - mxy) + C2
+    r1, r2 = dr.rcp(mm + C1), dr.rcp(squares - mm + C2)
     inverse = dr.select(inside, r1 * r2, 0)
     value = a1 * a2 * inverse
     grad_mean = 2 * my * (a2 - a1) * inverse + 2 * mx * value * (r2 - r1)
@@ -150,17 +148,16 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 class _Strips:
     """Where pixels stand in memory. Threads hold some `columns` of a row or ROWS of a column.
 
-    Pictures and partials are planes, of one channel and of three; so are moments, or they stand by pixels, four each
-    (`PACKED`). Rows are as long as their strips; beyond the picture, pictures and partials are 0.
+    Pictures are planes of one channel, moments and partials of three. Rows are as long as their strips; beyond the
+    picture, pictures and partials are 0.
 
     across, down: strips of a row, of a column;  stride: pixels of a row
     """
 
     def __init__(self, width: int, height: int) -> None:
         self.width, self.height = width, height
-        self.columns = COLUMNS[select()]
-        self.across, self.down = -(-width // self.columns), -(-height // ROWS)
-        self.stride = self.across * self.columns
+        self.across, self.down = -(-width // COLUMNS), -(-height // ROWS)
+        self.stride = self.across * COLUMNS
 
     def padded(self, plane: Float) -> Float:
         """A plane [height * width] as one [height * stride], 0 beyond the picture."""
@@ -179,10 +176,10 @@ class _Strips:
 
     def read_row(self, plane: Float, row: UInt32, strip: UInt32, halo: int) -> list[Float]:
         """A strip's pixels and `halo` to either side, 0 beyond the row's ends."""
-        beside, values = -(-halo // self.columns), list[Float]()
+        beside, values = -(-halo // COLUMNS), list[Float]()
         for place, inside in _neighbours(strip, range(-beside, beside + 1), self.across):
-            values += _read(plane, self.columns, row * self.across + place, inside)
-        spare = beside * self.columns - halo
+            values += _read(plane, row * self.across + place, inside)
+        spare = beside * COLUMNS - halo
         return values[spare : len(values) - spare]
 
     def read_moments(self, moments: list[Float], channel: UInt32, first: UInt32, column: UInt32) -> list[list[Float]]:
@@ -190,8 +187,6 @@ class _Strips:
         places = _neighbours(first, range(-2 * RADIUS, ROWS + 2 * RADIUS), self.height)
         start = channel * (self.height * self.stride) + column
         pixels = [(start + place * self.stride, inside) for place, inside in places]
-        if select() in PACKED:
-            return _transposed([_read(moments[0], 4, *pixel) for pixel in pixels])
         return [[dr.gather(ad.Float, plane, *pixel) for pixel in pixels] for plane in moments]
 
 
@@ -201,9 +196,9 @@ def _neighbours(first: UInt32, offsets: range, extent: int) -> list[tuple[UInt32
     return [(place, place < extent) for place in places]
 
 
-def _read(array: Float, size: int, index: UInt32, active: Bool) -> list[Float]:
-    """Packet `index` of `size` numbers, zeros where not `active`."""
-    return list(dr.gather(ad.ArrayXf, array, index, active, shape=(size, dr.width(index))))
+def _read(array: Float, index: UInt32, active: Bool) -> list[Float]:
+    """Packet `index` of `COLUMNS` numbers, zeros where not `active`."""
+    return list(dr.gather(ad.Array4f, array, index, active))
 
 
 def _transposed(lists: Sequence[Sequence[Float]]) -> list[list[Float]]:
