@@ -11,11 +11,12 @@ from spacesim.backend.kernels import llvm
 from spacesim.backend.kernels.llvm import LlvmKernel, empty, is_usable
 from spacesim.backend.kernels.llvm_text import Text
 from spacesim.backend.upload import upload
-from spacesim.splat.raster import blend, slot_sums
+from spacesim.splat.raster import adjoint, blend, slot_sums
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import pair_sort, record_copy
 from spacesim.splat.raster.project import Pinhole, project
+from spacesim.splat.train.loss import strips
 
 pytestmark = pytest.mark.threads
 
@@ -24,6 +25,8 @@ pytestmark = pytest.mark.threads
 def _llvm() -> None:
     if select() != "llvm":
         pytest.skip("such kernels are a CPU's")
+    if llvm.dr_library() is None:
+        pytest.skip("Dr.Jit's library is not known here")
     assert is_usable()
 
 
@@ -148,14 +151,51 @@ def test_dr_jits_kernels_give_the_same_bits(size, count, channels, absolute, mon
         places = [lists.splat, lists.start, lists.end, lists.place, lists.order, lists.first_slot, lists.slot_count]
         return [np.array(value) for value in [*places, *blended.features, blended.transmittance, *gradients]]
 
+    launched = []
     with monkeypatch.context() as patch:
-        launched = []
         for module in (pair_sort, record_copy, slot_sums):
-            patch.setattr(module, "empty", lambda kind, size: launched.append(size) or empty(kind, size))
+            kernel = module._kernel
+            patch.setattr(module, "_kernel", lambda *of, m=module, k=kernel: launched.append(m) or k(*of))
         ours = results()
-    assert launched
-    for module in (binning, blend, record_copy, slot_sums):
+    assert {*launched} == {pair_sort, record_copy, slot_sums}
+    for module in (binning, blend, record_copy, adjoint):
         monkeypatch.setattr(module, "is_usable", lambda: False)
     for value, other in zip(ours, results(), strict=True):
         np.testing.assert_array_equal(value, other)
     assert any(np.abs(value).max() > 0 for value in ours[7:])
+
+
+@pytest.mark.parametrize("threads", [1, 16, 64])
+def test_no_bit_depends_on_the_number_of_threads(threads):
+    """Of lists, gradients and the loss; a picture of several blocks of columns."""
+    count, size = 5000, (300, 90)
+    view, rng = record("perspective", *size), np.random.default_rng(2)
+    splats, footprints = project(Gaussians.from_numpy(random_splats(count, seed=3, degree=0)), Pinhole.of(view))
+    pictures = [ad.Array3f([upload(row) for row in rng.uniform(size=(3, 27000)).astype(np.float32)]) for _ in range(2)]
+
+    def results() -> list[np.ndarray]:
+        lists = binning.bin_splats(splats, footprints, *size)
+        sums, gradient = strips.loss_and_gradient(*pictures, *size, 0.2)
+        return [np.array(value) for value in (lists.splat, lists.place, lists.end, sums, *gradient)]
+
+    before, usual = results(), dr.thread_count()
+    dr.set_thread_count(threads)
+    try:
+        found = results()
+    finally:
+        dr.set_thread_count(usual)
+    for value, other in zip(before, found, strict=True):
+        np.testing.assert_array_equal(value, other)
+
+
+def test_literals_have_memory_of_their_own():
+    """Numbers that stand for whole planes are told apart, and made as long as these."""
+    rng, (width, height) = np.random.default_rng(3), (40, 30)
+    prediction = ad.Array3f([upload(row) for row in rng.uniform(size=(3, width * height)).astype(np.float32)])
+    whole = ad.Array3f([upload(np.full(width * height, value, np.float32)) for value in (0.1, 0.5, 0.9)])
+    expected, gradient = strips.loss_and_gradient(prediction, whole, width, height, 0.2)
+    literals = ad.Array3f([dr.full(ad.Float, value, width * height) for value in (0.1, 0.5, 0.9)])
+    for target in (literals, ad.Array3f(0.1, 0.5, 0.9)):
+        sums, found = strips.loss_and_gradient(prediction, target, width, height, 0.2)
+        np.testing.assert_array_equal(np.array(sums), np.array(expected))
+        np.testing.assert_array_equal(np.array(found), np.array(gradient))

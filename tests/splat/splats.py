@@ -6,10 +6,10 @@ from spacesim.backend import ad
 from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
 from spacesim.splat.light.surroundings import SKY
-from spacesim.splat.raster import adjoint, blend, records, walks
+from spacesim.splat.raster import adjoint, blend, records, render, walks
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera, Pinhole
 from spacesim.splat.raster.lists import bin as binning
-from spacesim.splat.raster.lists import tiles
+from spacesim.splat.raster.lists import record_copy, tiles
 from spacesim.splat.train.strategies.strategy import OnScreen
 
 
@@ -17,6 +17,8 @@ def take_cudas(monkeypatch) -> None:
     """CUDA's way of drawing, on the backend that runs."""
     for module in (binning, tiles, records, adjoint, blend, walks):
         monkeypatch.setattr(module, "select", lambda: "cuda")
+    for module in (adjoint, binning, blend, record_copy, render):
+        monkeypatch.setattr(module, "is_usable", lambda: False)
 
 
 def light_of(values: np.ndarray) -> np.ndarray:

@@ -47,21 +47,25 @@ class LlvmKernel:
             functions.append(text.finish())
         launch = _launch([name for name, _ in stages], self._size - len(stages))
         self._function = _compiled("\n".join([DECLARED, *functions, launch]))
-        self._used: deque[Any] = deque()  # parameters of launches, the oldest first
 
     def __call__(self, counts: Sequence[int], arrays: Sequence[Any], numbers: Sequence[int]) -> None:
-        """Launch it behind what Dr.Jit was asked for. counts: of the stages, above 0;  arrays: of Dr.Jit's, evaluated
-        here where they are not, those to be written of `empty`"""
+        """Launch it behind what Dr.Jit was asked for: where that is over, at once, without a word in its history.
+
+        counts: of the stages, above 0;  arrays: of Dr.Jit's, made opaque here, those to be written of `empty`
+        """
         assert (len(arrays), len(numbers), len(counts)) == self._is_of
         threads = self._threads
-        load_drjit().eval(arrays)
+        load_drjit().make_opaque(arrays)  # a literal has no memory of its own
         with one_at_a_time:
-            is_free = self._used and self._used[0][_DONE]
-            values = self._used.popleft() if is_free else (c_uint64 * self._size)()
+            while _launched and _launched[0][_DONE]:
+                _launched.popleft()
             addresses = [threads.address(array) for array in arrays]
-            values[:] = [*threads.functions, 0, *addresses, *numbers, *counts]
-            self._used.append(values)
+            values = (c_uint64 * self._size)(*threads.functions, 0, *addresses, *numbers, *counts)
+            _launched.append(values)
             threads.enqueue(_BACKEND, self._function, addressof(values))
+
+
+_launched: deque[Any] = deque()  # parameters of launches that may not be over, the oldest first
 
 
 def empty(kind: Any, size: int) -> Any:
@@ -81,19 +85,33 @@ def is_usable() -> bool:
 def _runs() -> bool:
     """Whether they run here: tried once in a process."""
     dr = load_drjit()
-    count, numbers = 100, dr.arange(ad.UInt32, 100)
+    numbers, results = dr.arange(ad.Float, 2 * _SIZE), empty(ad.Float, 2 * _SIZE + 1)
     try:
-        kernel = LlvmKernel(["source", "target"], ["added"], ("add", _add))
+        LlvmKernel(["numbers", "results"], ["end"], ("try", _try))([1], [numbers, results], [_SIZE + 3])
     except RuntimeError as reason:  # whatever the libraries say: Dr.Jit computes the same
         log.info("no kernels beside Dr.Jit's, which take longer (%s)", reason)
         return False
-    target = empty(ad.UInt32, count)
-    kernel([count], [numbers, target], [5])
-    return bool(dr.all(target == numbers + 5))
+    index = dr.arange(ad.UInt32, 2 * _SIZE)
+    squares = dr.select(index < _SIZE + 3, numbers * numbers + numbers, 0)
+    found = dr.gather(ad.Float, results, index)
+    is_right = dr.all((found == squares) | ((index >= _SIZE + 3) & (index < 2 * _SIZE)))
+    return bool(is_right) and float(results[2 * _SIZE]) == float(dr.sum(squares)[0])
 
 
-def _add(text: Text) -> None:
-    text.store("target", text.index, text.load("source", text.index) + text.number("added"))
+_SIZE = 16  # of the vectors of kernels
+
+
+def _try(text: Text) -> None:
+    """One of each instruction that calls for more than LLVM's core: x^2 + x up to a number, and the sum of these."""
+    total = text.zeros(_SIZE)
+    for start in (text.integer(0), text.integer(_SIZE)):
+        text.prefetch("numbers", start)
+        lanes = text.lanes(_SIZE, start, text.number("end"))
+        values = text.load_lanes("numbers", start, lanes)
+        squares = text.fma(values, values, values)
+        text.store_lanes("results", start, squares, lanes)
+        total = total + squares
+    text.store("results", text.integer(2 * _SIZE), text.sum(total))
 
 
 def _launch(names: Sequence[str], place: int) -> str:
@@ -129,7 +147,7 @@ class _Threads:
         if library is None or functions is None:
             raise RuntimeError("Dr.Jit's library is not known")
         try:
-            pool = ctypes.CDLL(str(Path(str(library._name)).with_name("libnanothread.so")))
+            pool = ctypes.CDLL(str(Path(library._name).with_name(f"libnanothread{Path(library._name).suffix}")))
             self.enqueue = library[_ENQUEUE]
             found = [pool[name] for name in _FUNCTIONS]
         except (OSError, AttributeError) as error:
@@ -141,7 +159,9 @@ class _Threads:
     def address(self, array: Any) -> int:
         """Of an evaluated array's numbers."""
         start = c_void_p()
-        self._release(self._address(array.index, byref(start)))
+        found = self._address(array.index, byref(start))
+        self._release(found)
+        assert found == array.index, "an array has memory of its own"
         return start.value or 0
 
 

@@ -36,6 +36,7 @@ class Value:
         return self.text.value(INT, f"urem {INT} {self.name}, {other.name}")
 
     def __lt__(self, other: "Value") -> "Value":
+        """Integers as unsigned: one below 0 is beyond all others."""
         operation, entry = ("icmp ult", INT) if self.kind == INT else ("fcmp olt", FLOAT)
         return self.text.value(self.kind.replace(entry, "i1"), f"{operation} {self.kind} {self.name}, {other.name}")
 
@@ -128,6 +129,10 @@ class Text:
         """Of a vector whose first entry has a number, whether each is below another."""
         call = f"@llvm.get.active.lane.mask.v{size}i1.i64(i64 {first.name}, i64 {end.name})"
         return self.value(f"<{size} x i1>", f"call <{size} x i1> {call}")
+
+    def no_lanes(self, size: int) -> Value:
+        """Of a vector, none."""
+        return Value(self, f"<{size} x i1>", "zeroinitializer")
 
     def load(self, array: str, index: Value) -> Value:
         """An unsigned integer of 32 bits."""

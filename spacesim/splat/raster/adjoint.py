@@ -17,6 +17,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.arrays import Bool, Float, UInt32
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.packet import load, packet, packet_sizes, packets, store
 from spacesim.splat.raster.lists.pieces import count_pieces, read_pieces
 from spacesim.splat.raster.lists.tiles import TileLists, TileShape, pixel_in_tile, thread_offsets, thread_pixels
@@ -59,14 +60,29 @@ def by_tiles(
     absolute: bool,
 ) -> SplatGradients:
     """See `blend.backward`. A thread for a block of a tile's pixels."""
-    return gather_slots(
-        _replay(state, lists, grad_planes, absolute), splats, lists, len(grad_planes.features), absolute
-    )
+    if not is_usable():
+        return _by_tiles(splats, state, lists, grad_planes, absolute)
+    channels, slots = len(grad_planes.features), _replay(state, lists, grad_planes, absolute)
+    added = add_slots(slots, splats, lists, channels, absolute)
+    if added is None:
+        return _gather_slots(slots, splats, lists, channels, absolute)
+    none = cast(Float, None)  # nothing reads them
+    x, y, a, b, c, opacity, *rest = added
+    absolute_x, absolute_y = rest[channels:] or [none, none]
+    return SplatGradients(Splats(x, y, a, b, c, opacity, none), rest[:channels], absolute_x, absolute_y)
+
+
+@recorded
+def _by_tiles(
+    splats: Splats, state: BlendState, lists: TileLists, grad_planes: PlaneGradients, absolute: bool
+) -> SplatGradients:
+    slots = _replay(state, lists, grad_planes, absolute)
+    return _gather_slots(slots, splats, lists, len(grad_planes.features), absolute)
 
 
 @recorded(elements=lambda _, state, lists, grad_planes, absolute: grad_planes.width * grad_planes.height)
 def _replay(state: BlendState, lists: TileLists, grad_planes: PlaneGradients, absolute: bool) -> list[Float]:
-    """Sums of pairs, as `gather_slots` takes them."""
+    """Sums of pairs, as `_gather_slots` takes them."""
     channels, shape = len(grad_planes.features), lists.shape
     thread, offsets = thread_pixels(lists), thread_offsets(shape)
     transmittance, last, behind, gradients = [], [], [], []
@@ -348,25 +364,14 @@ def reduce_mode(bytes_: int, shape: TileShape) -> dr.ReduceMode:
     return dr.ReduceMode.Expand if dr.thread_count() * bytes_ < COPIES_BYTES else dr.ReduceMode.Local
 
 
-def gather_slots(slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool) -> SplatGradients:
-    """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
-
-    slots: arrays [F P], F of a pair's sums side by side in each
-    """
-    added = add_slots(slots, splats, lists, channels, absolute)
-    if added is None:
-        return _gather_slots(slots, splats, lists, channels, absolute)
-    none = cast(Float, None)  # nothing reads them
-    x, y, a, b, c, opacity, *rest = added
-    absolute_x, absolute_y = rest[channels:] or [none, none]
-    return SplatGradients(Splats(x, y, a, b, c, opacity, none), rest[:channels], absolute_x, absolute_y)
-
-
 @recorded(elements=lambda _, slots, splats, *_rest: dr.width(splats.x))
 def _gather_slots(
     slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool
 ) -> SplatGradients:
-    """`gather_slots` of Dr.Jit's."""
+    """Add up each splat's slots, in order, and turn the sums into gradients of the splat's own numbers.
+
+    slots: arrays [F P], F of a pair's sums side by side in each
+    """
     splat = dr.arange(ad.UInt32, dr.width(splats.x))
     position = dr.gather(ad.UInt32, lists.first_slot, splat)
     end = position + dr.gather(ad.UInt32, lists.slot_count, splat)

@@ -75,7 +75,7 @@ def blend_lists(
     """`forward`, which may be a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket
     of the adjoint, 0 for that by tiles, None where there is none"""
     size = width, height
-    if is_usable():  # records are copied between two recordings
+    if is_usable() and lists.capacity > 0:  # records are copied between two recordings
         records = list_records(_packed(splats, features, capacity), lists, capacity)
         return _blend_records(records, len(features), lists, size, capacity, bucket)
     return _blend_splats(splats, features, lists, size, capacity, bucket)

@@ -133,7 +133,7 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
         if size[0] * size[1] >= MANY_PIXELS and can_read_async():
             listed = _list_splats(inputs, more, keeps_splats, *listing)
             number = AsyncNumber(listed.sums)
-            planes = _blend_records(list_records(listed.records, listed.lists, most), listed.lists, counts, size, most)
+            planes = _blend_packed(listed.records, listed.lists, counts, size, most)
             pairs = number.wait()
         else:
             listed, planes = _draw_at_once(inputs, more, keeps_splats, counts, *listing)
@@ -204,8 +204,7 @@ def _draw_at_once(
     """`_list_splats`, and the planes."""
     listed = _list_splats(inputs, more, keeps_splats, count, limit, capacities, grid)
     size = inputs[1].width, inputs[1].height
-    records = list_records(listed.records, listed.lists, capacities.splats)
-    return listed, _blend_records(records, listed.lists, counts, size, capacities.splats)
+    return listed, _blend_packed(listed.records, listed.lists, counts, size, capacities.splats)
 
 
 @recorded
@@ -232,6 +231,14 @@ def _draw_boxes(
 
 
 _draw_boxes_at_once = recorded(_draw_boxes, elements=lambda _, _prepared, _counts, size, *_rest: size[0] * size[1])
+
+
+@recorded(elements=lambda _, _records, _lists, _counts, size, *_rest: size[0] * size[1])
+def _blend_packed(
+    packed: list[Float], lists: TileLists, counts: Counts, size: tuple[int, int], capacity: int
+) -> Planes:
+    """Planes of `packed`, `pack_records` of all that is blended, with this capacity."""
+    return _blend_records(list_records(packed, lists, capacity), lists, counts, size, capacity)
 
 
 @recorded(elements=lambda _, _records, _lists, _counts, size, *_rest: size[0] * size[1])

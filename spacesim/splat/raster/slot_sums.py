@@ -1,4 +1,4 @@
-"""Gradients of splats from the sums of their pairs: `adjoint.gather_slots` on a CPU, as text for LLVM.
+"""Gradients of splats from the sums of their pairs: `adjoint._gather_slots` on a CPU, as text for LLVM.
 
 A thread goes through a splat's slots by itself, a pair's numbers side by side in registers. Dr.Jit's lanes, a splat
 each, wait for the longest of sixteen, and turn the numbers around.
@@ -11,7 +11,7 @@ import drjit as dr
 
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
-from spacesim.backend.kernels.llvm import LlvmKernel, empty, is_usable
+from spacesim.backend.kernels.llvm import LlvmKernel, empty
 from spacesim.backend.kernels.llvm_text import Text
 from spacesim.backend.packet import packet_sizes
 from spacesim.splat.raster.lists.tiles import TileLists
@@ -27,9 +27,9 @@ def add_slots(
     slots: list[Float], splats: Splats, lists: TileLists, channels: int, absolute: bool
 ) -> list[Float] | None:
     """Gradients by `SHAPE`, features and, if `absolute`, sums of |d / d x| and |d / d y|, [N] each; None where it is
-    Dr.Jit's to add. slots: as `adjoint.gather_slots` takes them"""
+    Dr.Jit's to add. slots: as `adjoint._gather_slots` takes them"""
     count, of_splats = dr.width(splats.x), [splats.a, splats.b, splats.c, splats.opacity]
-    if lists.place is None or not is_usable() or any(dr.width(row) != count for row in of_splats):
+    if lists.place is None or any(dr.width(row) != count for row in of_splats):
         return None
     results = [empty(ad.Float, count) for _ in range(len(SHAPE) + channels + 2 * absolute)]
     arrays = [lists.first_slot, lists.slot_count, lists.place, *slots, *of_splats, *results]

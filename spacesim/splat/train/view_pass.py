@@ -21,7 +21,7 @@ from spacesim.splat.raster.adjoint import SplatGradients
 from spacesim.splat.raster.blend import backward
 from spacesim.splat.raster.cameras import pinhole_numbers
 from spacesim.splat.raster.gaussians import Gaussians
-from spacesim.splat.raster.lists.bin import lists_of_boxes, make_lists
+from spacesim.splat.raster.lists.bin import lists_of_boxes
 from spacesim.splat.raster.lists.capacity import Extent
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Pinhole
@@ -158,7 +158,10 @@ class ViewPass:
         )
         expected = pairs.expected(extent)
         drawn: ViewSplats | None = None
-        if expected is not None and select() == "cuda":
+        if expected is None:
+            drawn = self._find_boxes(asked, extent.most, grid)
+            splats, values, radii = drawn.splats, drawn.values, drawn.radii
+        else:
             listing = held(expected, "pairs"), extent.capacities(expected), grid
             if light is None:
                 whole = self._draw(asked, *listing)
@@ -166,11 +169,6 @@ class ViewPass:
                 return RenderedView(camera, downscale, whole.radii, whole.channels, None, whole.tape)
             splats, values, radii, lists, pair_ends = self._list(asked, *listing)
             pairs.check(extent, pair_ends, expected)
-        else:  # part by part: on LLVM kernels of text stand between
-            drawn = self._find_boxes(asked, extent.most, grid)
-            splats, values, radii = drawn.splats, drawn.values, drawn.radii
-            if expected is not None:
-                lists, drawn = _expected_lists(drawn, extent, pairs, expected), None
         batch: PaddedBatch | None = None
         if self._hidden is not None and light is not None:
             if drawn is not None:
@@ -261,15 +259,6 @@ def _hidden_weight(config: TrainConfig) -> float | None:
 def _lists_of(drawn: ViewSplats, extent: Extent, pairs: ViewPairs) -> TileLists:
     """The host waits for how many pairs there are."""
     return lists_of_boxes(drawn.footprints, drawn.boxes, extent, pairs.counted(extent, drawn.boxes))
-
-
-def _expected_lists(drawn: ViewSplats, extent: Extent, pairs: ViewPairs, expected: int) -> TileLists:
-    """The host waits for nothing."""
-    limit, capacities = held(expected, "pairs"), extent.capacities(expected)
-    lists = make_lists(drawn.footprints, drawn.boxes, limit, capacities, extent.grid)
-    assert drawn.boxes.pair_ends is not None
-    pairs.check(extent, drawn.boxes.pair_ends, expected)
-    return lists
 
 
 def _elements(arrays: list[Float], view: ViewRequest, *_: object) -> int:

@@ -324,7 +324,7 @@ def test_tiles_are_dealt_longest_first(lengths):
     lengths = np.random.default_rng(0).permutation(lengths)
     grid, ends = boxes.Grid(len(lengths), 1, tiles.TileShape(8, 8, 4, 2)), np.cumsum(lengths)
     start, end = (upload(bounds.astype(np.uint32), ad.UInt32) for bounds in (ends - lengths, ends))
-    order = np.array(binning._longest_first(start, end, grid))
+    order = np.array(binning._longest_first.traced(start, end, grid))
     assert sorted(order.tolist()) == list(range(len(lengths)))
     dealt = np.minimum(lengths, binning.MAX_SORTED_LENGTH)[order]
     ranks = np.sort(np.minimum(lengths, binning.MAX_SORTED_LENGTH))[::-1]

@@ -13,8 +13,8 @@ from spacesim.backend.upload import upload
 from spacesim.data.errors import WorkError
 from spacesim.data.geometry import quaternion_from_rotation, rotation_from_quaternion
 from spacesim.data.records import Camera
+from spacesim.splat.raster import adjoint, records, walks
 from spacesim.splat.raster import blend as rasterize
-from spacesim.splat.raster import records, walks
 from spacesim.splat.raster import render as rendering
 from spacesim.splat.raster.gaussians import NAMES, Gaussians
 from spacesim.splat.raster.lists import bin as binning
@@ -461,7 +461,7 @@ SHAPES = [(8, 8, 4, 2), (8, 8, 4, 4), (8, 8, 2, 4), (8, 8, 1, 8), (16, 8, 16, 1)
 def test_any_tile_shape_blends_the_same(shape, monkeypatch):
     """Threads that hold columns or blocks, tiles that share a packet or fill it: pictures and gradients by the twin."""
     monkeypatch.setattr(boxes, "tile_shape", lambda *_: tiles.TileShape(*shape))
-    for module in (rasterize, rendering, binning):
+    for module in (rasterize, rendering, binning, adjoint, records):
         for function in filter(lambda one: isinstance(one, Recorded), vars(module).values()):
             function._frozen.clear()  # else what another way has recorded for such tiles would be replayed
     arrays, view = random_splats(25, seed=11, degree=1), camera(24, 17)

@@ -23,7 +23,7 @@ def sort_pairs(tile: UInt32, splat: UInt32, tiles: int) -> tuple[UInt32, UInt32,
     tile, splat: of each pair [P], T pairs of no tile, which come behind all lists
     """
     pairs = dr.width(tile)
-    chunks = min(CHUNKS, 2 * dr.thread_count())
+    chunks = min(CHUNKS, 2 * dr.thread_count(), 1 + pairs // tiles)
     chunk = -(-pairs // chunks)
     start, end, counters = (empty(ad.UInt32, size) for size in (tiles, tiles, chunks * (tiles + 1)))
     in_order, place = (empty(ad.UInt32, pairs) for _ in range(2))

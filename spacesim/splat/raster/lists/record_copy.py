@@ -21,9 +21,9 @@ def copy_records(packed: list[Float], lists: TileLists, capacity: int) -> list[F
 
     packed: of `pack_records`, with this capacity
     """
-    sizes = tuple(dr.width(array) // capacity for array in packed)
     if lists.place is None or not is_usable():
         return None
+    sizes = tuple(dr.width(array) // capacity for array in packed)
     copies = [empty(ad.Float, size * lists.capacity) for size in sizes]
     last = lists.tiles_x * lists.tiles_y - 1
     _kernel(sizes)([-(-lists.capacity // BLOCK)], [lists.splat, lists.end, *packed, *copies], [last])

@@ -146,7 +146,7 @@ def _blur(values: Sequence[Float]) -> list[Float]:
 
 
 class _Strips:
-    """Where pixels stand in memory. Threads hold some `columns` of a row or ROWS of a column.
+    """Where pixels stand in memory. Threads hold `COLUMNS` of a row or `ROWS` of a column.
 
     Pictures are planes of one channel, moments and partials of three. Rows are as long as their strips; beyond the
     picture, pictures and partials are 0.

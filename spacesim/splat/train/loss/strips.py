@@ -1,7 +1,8 @@
 """The `photometric_loss` and its gradient on a CPU, as text for LLVM.
 
-A task takes strips of rows one after another: what it makes of them, moments under the window and SSIM's derivatives by
-these, stays in its core's cache. Dr.Jit's kernels write all of that to memory, and turn it around.
+A task takes blocks of 32 rows and 256 columns one after another: what it makes of them, moments under the window and
+SSIM's derivatives by these, stays in its core's cache. Dr.Jit's kernels write all of that to memory, and turn it
+around.
 """
 
 from collections.abc import Sequence
@@ -16,32 +17,36 @@ from spacesim.backend.kernels.llvm_text import Text, Value, float_bits
 from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
 
 LANES = 16  #: pixels of a vector
-ROWS = 32  #: of a strip
-_FAR, _NEAR = ROWS + 4 * RADIUS, ROWS + 2 * RADIUS  # rows whose moments, whose derivatives a strip needs
+ROWS, COLUMNS = 32, 16  #: of a block; columns are vectors
+_FAR, _NEAR = ROWS + 4 * RADIUS, ROWS + 2 * RADIUS  # rows whose moments, whose derivatives a block needs
 # Rows of a task's room, one behind the other: of the pictures and their products; of the moments, blurred along rows,
-# later the derivatives, blurred along columns; of the derivatives.
+# later the derivatives, blurred along columns; of the derivatives. To either side of a block's columns each has one
+# more, whose pixels beside the block are needed, and one of nothing.
 _MOMENTS, _DERIVATIVES = 4, 3  # x, y, x^2 + y^2, x y; by the means of x, of x^2 and of x y
 _BLURRED = _MOMENTS
 _PARTIALS = _BLURRED + _MOMENTS * _FAR
-_ROOM = _PARTIALS + _DERIVATIVES * _NEAR
+_ROWS_OF_ROOM = _PARTIALS + _DERIVATIVES * _NEAR
+_STRIDE = (COLUMNS + 4) * LANES
+_ROOM = _ROWS_OF_ROOM * _STRIDE
 _PLANES = [[f"{name}{channel}" for channel in range(3)] for name in ("x", "y", "gradient")]
-_NUMBERS = "width", "height", "vectors", "strips", "tasks", "l1", "ssim"
+_NUMBERS = "width", "height", "vectors", "across", "strips", "tasks", "l1", "ssim"
 
 
 def loss_and_gradient(
     prediction: Array3f, target: Array3f, width: int, height: int, ssim_weight: float
 ) -> tuple[Float, Array3f]:
     """`photometric_loss`, in parts to be added up, and its gradient by `prediction`."""
-    vectors, strips = -(-width // LANES), -(-height // ROWS)
-    tasks = min(dr.thread_count(), 3 * strips)
-    gradient = [empty(ad.Float, width * height) for _ in range(3)]
-    sums, room = empty(ad.Float, 3 * strips), empty(ad.Float, tasks * _ROOM * LANES * (vectors + 2))
-    shares = [float_bits(share / (3 * width * height)) for share in (1 - ssim_weight, ssim_weight)]
-    _kernel()(
-        [tasks],
-        [*prediction, *target, *gradient, sums, room],
-        [width, height, vectors, strips, tasks, *shares],
-    )
+    count, vectors = width * height, -(-width // LANES)
+    across, strips = -(-vectors // COLUMNS), -(-height // ROWS)
+    tasks = min(dr.thread_count(), 3 * strips * across)
+    gradient = [empty(ad.Float, count) for _ in range(3)]
+    sums, room = empty(ad.Float, 3 * strips * across), empty(ad.Float, tasks * _ROOM)
+    planes = [
+        plane if dr.width(plane) == count else plane + dr.zeros(ad.Float, count) for plane in (*prediction, *target)
+    ]
+    shares = [float_bits(share / (3 * count)) for share in (1 - ssim_weight, ssim_weight)]
+    numbers = [width, height, vectors, across, strips, tasks, *shares]
+    _kernel()([tasks], [*planes, *gradient, sums, room], numbers)
     return sums, ad.Array3f(gradient)
 
 
@@ -52,54 +57,68 @@ def _kernel() -> LlvmKernel:
 
 
 def _write(text: Text) -> None:
-    zero, vectors, strips = text.integer(0), text.number("vectors"), text.number("strips")
-    stride = (vectors + 2) * LANES  # of a row: to either side of a picture there is nothing
-    room = text.index * stride * _ROOM
-    with text.loop(room, room + stride * _ROOM, step=LANES) as loop:
+    across, strips = text.number("across"), text.number("strips")
+    room = text.index * _ROOM
+    with text.loop(room, room + _ROOM, step=LANES) as loop:
         text.store("room", loop.at, text.zeros(LANES))
-    with text.loop(text.index, strips * 3, step=text.number("tasks")) as turn:
+    blocks = strips * across
+    with text.loop(text.index, blocks * 3, step=text.number("tasks")) as turn:
         for names in _PLANES:
-            text.first_of(names, turn.at // strips, names[0][:-1])
-        strip = _Strip(text, room + LANES, stride, (turn.at % strips) * ROWS)
-        with text.loop(zero, text.integer(_FAR)) as rows:
-            strip.blur_pictures(rows.at)
-        with text.loop(zero, vectors, [text.zeros(LANES)]) as columns:
-            with text.loop(zero, text.integer(_NEAR), columns.state) as rows:
-                rows.following = [strip.compare(columns.at, rows.at, rows.state[0])]
+            text.first_of(names, turn.at // blocks, names[0][:-1])
+        within = turn.at % blocks
+        block = _Block(text, room, (within // across) * ROWS, (within % across) * COLUMNS)
+        with text.loop(text.integer(0), text.integer(_FAR)) as rows:
+            block.blur_pictures(rows.at)
+        with text.loop(block.around, block.around_end, [text.zeros(LANES)]) as columns:
+            with text.loop(text.integer(0), text.integer(_NEAR), columns.state) as rows:
+                rows.following = [block.compare(columns.at, rows.at, rows.state[0])]
             columns.following = rows.state
-            with text.loop(zero, text.integer(ROWS)) as rows:
-                strip.blur_derivatives(columns.at, rows.at)
-        with text.loop(zero, text.integer(ROWS), [text.zeros(LANES)]) as rows:
-            with text.loop(zero, vectors, rows.state) as along:
-                along.following = [strip.write_gradient(along.at, rows.at, along.state[0])]
+            with text.loop(text.integer(0), text.integer(ROWS)) as rows:
+                block.blur_derivatives(columns.at, rows.at)
+        with text.loop(text.integer(0), text.integer(ROWS), [text.zeros(LANES)]) as rows:
+            for i in range(_DERIVATIVES):
+                block.end_row(rows.at + (_BLURRED + i * _FAR))
+            with text.loop(block.left, block.right, rows.state) as along:
+                along.following = [block.write_gradient(along.at, rows.at, along.state[0])]
             rows.following = along.state
         dissimilarity = text.sum(columns.state[0]) * text.float_number("ssim")
         text.store("sums", turn.at, text.fma(text.sum(rows.state[0]), text.float_number("l1"), dissimilarity))
 
 
-class _Strip:
-    """One strip; columns are numbered by vectors.
+class _Block:
+    """One block. Columns are numbered by vectors, as in the picture.
 
-    first: of a row of the room, the picture's first number;  stride: of rows;  top: first row in the picture
+    room: the task's;  top, left: first row and column
     """
 
-    def __init__(self, text: Text, first: Value, stride: Value, top: Value) -> None:
-        self.text, self.first, self.stride, self.top = text, first, stride, top
+    def __init__(self, text: Text, room: Value, top: Value, left: Value) -> None:
+        self.text, self.room, self.top, self.left = text, room, top, left
+        vectors = text.number("vectors")
+        self.right = (left + COLUMNS).least(vectors)  #: one past the last column
+        #: the same with the columns beside the block, as far as there are any
+        self.around = left - (text.integer(0) < left).choose(text.integer(1), text.integer(0))
+        self.around_end = (left + COLUMNS + 1).least(vectors)
+
+    def end_row(self, row: Value) -> None:
+        """Nothing behind a row of the room."""
+        self.text.store("room", self._place(row, self.around_end), self.text.zeros(LANES))
 
     def blur_pictures(self, row: Value) -> None:
-        """Moments blurred along a row, the first 2 RADIUS above the strip."""
-        text, zero, vectors = self.text, self.text.integer(0), self.text.number("vectors")
-        with text.loop(zero, vectors) as columns:
+        """Moments blurred along a row, the first 2 RADIUS above the block."""
+        text = self.text
+        with text.loop(self.around, self.around_end) as columns:
             _, x, y = self._pixels(columns.at, row - 2 * RADIUS)
             for i, value in enumerate((x, y, text.fma(x, x, y * y), x * y)):
                 text.store("room", self._place(text.integer(i), columns.at), value)
-        with text.loop(zero, vectors) as columns:
+        for i in range(_MOMENTS):
+            self.end_row(text.integer(i))
+        with text.loop(self.around, self.around_end) as columns:
             for i in range(_MOMENTS):
                 blurred = self._blurred_along(text.integer(i), columns.at)
                 text.store("room", self._place(row + (_BLURRED + i * _FAR), columns.at), blurred)
 
     def compare(self, column: Value, row: Value, total: Value) -> Value:
-        """SSIM's derivatives, the first RADIUS above the strip; 1 - SSIM of the strip's added to `total`."""
+        """SSIM's derivatives, the first RADIUS above the block; 1 - SSIM of the block's pixels added to `total`."""
         text = self.text
         means = [self._blurred_down(row + (_BLURRED + i * _FAR), column) for i in range(_MOMENTS)]
         value, *derivatives = _similarity(text, means)
@@ -108,16 +127,18 @@ class _Strip:
             place = self._place(row + (_PARTIALS + i * _NEAR), column)
             text.store("room", place, inside.choose(derivative, nothing))
         dissimilarity = inside.choose(text.floats(LANES, 1) - value, nothing)
-        return total + ((row - RADIUS) < text.integer(ROWS)).choose(dissimilarity, nothing)
+        for place, extent in ((row - RADIUS, text.integer(ROWS)), (column - self.left, text.integer(COLUMNS))):
+            dissimilarity = (place < extent).choose(dissimilarity, nothing)  # what is before the block is below 0
+        return total + dissimilarity
 
     def blur_derivatives(self, column: Value, row: Value) -> None:
-        """Along columns, of a row of the strip; in the place of this column's moments."""
+        """Along columns, of a row of the block; in the place of this column's moments."""
         for i in range(_DERIVATIVES):
             blurred = self._blurred_down(row + (_PARTIALS + i * _NEAR), column)
             self.text.store("room", self._place(row + (_BLURRED + i * _FAR), column), blurred)
 
     def write_gradient(self, column: Value, row: Value, total: Value) -> Value:
-        """Of a row of the strip; |x - y| added to `total`."""
+        """Of a row of the block; |x - y| added to `total`."""
         text = self.text
         inside, x, y = self._pixels(column, row)
         by_mean, by_square, by_product = (
@@ -131,7 +152,7 @@ class _Strip:
         return text.fma(difference, sign, total)
 
     def _pixels(self, column: Value, row: Value) -> tuple[Value, Value, Value]:
-        """(which are in the picture, prediction, target) of a row by its number from the strip's first."""
+        """(which are in the picture, prediction, target) of a row by its number from the block's first."""
         inside, pixel = self._inside(column, row), self._pixel(column, row)
         x, y = (self.text.load_lanes(name, pixel, inside) for name in ("x", "y"))
         return inside, x, y
@@ -141,13 +162,13 @@ class _Strip:
 
     def _inside(self, column: Value, row: Value) -> Value:
         """Which pixels of a vector are in the picture."""
-        of_picture = (self.top + row) < self.text.number("height")
-        end = of_picture.choose(self.text.number("width"), self.text.integer(0))
-        return self.text.lanes(LANES, column * LANES, end)
+        lanes = self.text.lanes(LANES, column * LANES, self.text.number("width"))
+        is_row = (self.top + row) < self.text.number("height")  # rows above the picture are below 0
+        return is_row.choose(lanes, self.text.no_lanes(LANES))
 
     def _place(self, row: Value, column: Value) -> Value:
         """Of a row of the room."""
-        return self.first + row * self.stride + column * LANES
+        return self.room + row * _STRIDE + (column - self.around + 1) * LANES
 
     def _blurred_along(self, row: Value, column: Value) -> Value:
         """Of the room."""

@@ -1,15 +1,18 @@
 """The training loss against scikit-image, scipy and finite differences."""
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 from skimage.metrics import structural_similarity
 
-from spacesim.backend import ad, recorded
+from spacesim.backend import ad, recorded, select
 from spacesim.backend.upload import upload
-from spacesim.splat.train.loss import photometric
+from spacesim.splat.train.loss import photometric, strips
 from spacesim.splat.train.loss.photometric import photometric_loss
+from spacesim.splat.train.stages import LossSettings, TargetImage, compared_pictures, picture_loss
 
 WIDTH, HEIGHT = 31, 23
 
@@ -98,9 +101,11 @@ def test_gradient_of_ssim_matches_central_differences():
 
 @pytest.mark.parametrize("way", ["the backend's", "Dr.Jit's"])
 @pytest.mark.parametrize("weight", [0.2, 1.0])
-@pytest.mark.parametrize("size", [(1, 1), (3, 40), (33, 8), (50, 27), (96, 48)])
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (33, 8), (50, 27), (70, 48), (34, 530)])
 def test_loss_and_gradient_equal_their_twin(monkeypatch, size, weight, way):
     """Of pictures smaller than the window, and of those that end within a thread's pixels."""
+    launched, kernel = [], strips._kernel
+    monkeypatch.setattr(strips, "_kernel", lambda: launched.append(True) or kernel())
     if way == "Dr.Jit's":
         monkeypatch.setattr(photometric, "is_usable", lambda: False)
     rng = np.random.default_rng(5)
@@ -114,6 +119,7 @@ def test_loss_and_gradient_equal_their_twin(monkeypatch, size, weight, way):
     assert float(dr.detach(loss)[0]) == pytest.approx(expected, rel=1e-5, abs=1e-7)
     found = np.array(dr.grad(prediction)).reshape(3, *size)
     np.testing.assert_allclose(found, gradient, atol=2e-5 * np.abs(gradient).max())
+    assert bool(launched) == (select() == "llvm" and way != "Dr.Jit's")
 
 
 def test_a_recorded_loss_repeats_to_the_bit(monkeypatch):
@@ -134,3 +140,38 @@ def test_a_recorded_loss_repeats_to_the_bit(monkeypatch):
         np.testing.assert_array_equal(one, two)
         np.testing.assert_array_equal(three, four)
         assert not np.array_equal(one, three)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{}, {"tone": "filmic", "supersample": 2}, {"downscale": 2}, {"radiance": 2.0}, {"visibility": 0.5}],
+)
+@pytest.mark.parametrize("gains", [None, [0.9, 1.0, 1.1]])
+def test_the_photometric_term_may_be_known_before(changed, gains):
+    """As training on a CPU has it: by itself, between two recordings; with all the ways to compare a picture."""
+    settings = replace(LossSettings(0.2, 0.0, 0.0, 0.0, 1.0, None), **changed)
+    rng, (width, height) = np.random.default_rng(7), (40, 36)
+    drawn, whole = (width * height * times**2 // settings.downscale**2 for times in (settings.supersample, 1))
+    planes = {"color": [upload(rng.uniform(0.1, 0.9, drawn).astype(np.float32)) for _ in range(3)]}
+    truth = {"radiance": [upload(rng.uniform(0.1, 0.4, whole).astype(np.float32)) for _ in range(3)]}
+    if settings.visibility:
+        planes["visibility"] = [upload(rng.uniform(size=drawn).astype(np.float32))]
+        truth["visibility"] = [upload(rng.uniform(size=whole).astype(np.float32))]
+    transmittance = upload(rng.uniform(0.1, 0.5, drawn).astype(np.float32))
+    rgba = upload(rng.integers(2**24, 2**32, width * height).astype(np.uint32), ad.UInt32)
+    background, valid = ad.Float([0.2, 0.1, 0.5]), upload(rng.uniform(size=width * height) < 0.9, ad.Bool)
+    target = TargetImage(rgba, background, valid, truth, None if gains is None else ad.Float(gains))
+    shown = planes, transmittance, target, (width, height), settings
+    size = width // settings.downscale, height // settings.downscale
+    compared = [dr.detach(picture) for picture in compared_pictures(*shown)]
+    prediction = ad.Array3f(compared[0])
+    dr.enable_grad(prediction)
+    term = photometric_loss(prediction, compared[1], *size, settings.ssim)
+    dr.backward(term)
+    known = dr.detach(term), dr.grad(prediction)
+    (value, by_planes, passed), (expected, of_planes, of_passed) = picture_loss(*shown, known), picture_loss(*shown)
+    assert float(value[0]) == pytest.approx(float(expected[0]), rel=1e-6)
+    for name, group in (of_planes | {"transmittance": [of_passed]}).items():
+        for found, plane in zip((by_planes | {"transmittance": [passed]})[name], group, strict=True):
+            np.testing.assert_allclose(np.array(found), np.array(plane), atol=1e-6 * np.abs(np.array(plane)).max())
+            assert np.abs(np.array(plane)).max() > 0
