@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 
 from spacesim.backend import ad, recorded
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.data.records import Camera
 from spacesim.splat.raster.blend import backward, forward
 from spacesim.splat.raster.gaussians import Gaussians
@@ -37,7 +38,8 @@ class Pipeline:
         self.truth = list(ad.Array3f(noise))
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
         dr.eval(self.gaussians.rows(), self.optimizer.arrays, self.truth, self.factors)
-        self._project, self._loss = recorded(project_views, limit=RECORDINGS), recorded(_loss, limit=RECORDINGS)
+        self._project = recorded(project_views, limit=RECORDINGS)
+        self._loss = _loss if is_usable() else recorded(_loss, limit=RECORDINGS)  # recordings take no text in
         self._update = Update(antialiased=False, scale=1.0)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()

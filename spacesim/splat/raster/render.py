@@ -121,7 +121,7 @@ def _draw(inputs: Inputs, more: Planes, keeps_splats: bool) -> tuple[Splats | No
 
     Where the number of pairs is expected, the host reads it when all is asked for: of a large picture while that is
     blended, which takes a second recording, and that as long as some kernels. Where it is not, the host waits for it
-    between two recordings. more: blended beside the outputs"""
+    between two recordings, on a CPU of more parts. more: blended beside the outputs"""
     rows, camera, *_ = inputs
     size, count = (camera.width, camera.height), dr.width(rows[0])
     extent = Extent.of(count, *size, few_sizes=True)

@@ -1,4 +1,4 @@
-"""The stages of a training step that Dr.Jit differentiates; each is recorded once and replayed."""
+"""The stages of a training step that Dr.Jit differentiates, as they are recorded and replayed."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

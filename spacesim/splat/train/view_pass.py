@@ -2,7 +2,7 @@
 
 All is recorded and replayed without tracing, lists and what reads them once for each capacity. Where the number of
 pairs is expected, a view is projected and listed in one recording, and blended in it where that needs no light; where
-it is not, the host waits between two.
+it is not, the host waits between two. On a CPU kernels of text stand between them.
 """
 
 from dataclasses import dataclass, field, replace

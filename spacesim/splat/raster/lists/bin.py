@@ -6,7 +6,7 @@ in no list. How the lists are put in order depends on the backend, the order doe
 
 - CUDA counts the pairs into their tiles and orders each list by itself (`counting.py`): a radix sort's many launches
   cost more than its work, and Dr.Jit 1.5 cannot replay them.
-- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile; both sorts are stable.
+- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile (`pair_sort.py`); both sorts are stable.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def bin_splats(splats: Splats, footprints: Footprints, width: int, height: int, 
     sorted or held in memory. few_sizes: of lists, for pictures from all over, each of which has another number of
     pairs; lists are up to half as long again.
 
-    Between its two parts, both recorded, the host waits for the number of pairs, which says how large arrays must be.
+    Between its two parts the host waits for the number of pairs, which says how large arrays must be.
     """
     extent = Extent.of(dr.width(splats.x), width, height, few_sizes)
     if extent.count == 0:
