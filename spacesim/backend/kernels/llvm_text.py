@@ -13,7 +13,7 @@ FIRST = 4  #: of the addresses among the parameters, 8 bytes each, behind what l
 class Value:
     """A result of an instruction, or a constant: an integer, a float32 or a vector of these."""
 
-    text: "Text" = field(repr=False)
+    text: "Text" = field(repr=False)  #: that has the instruction
     kind: str  #: of LLVM
     name: str  #: of LLVM, "%v1" or a constant's
 

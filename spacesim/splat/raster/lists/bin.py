@@ -6,7 +6,8 @@ in no list. How the lists are put in order depends on the backend, the order doe
 
 - CUDA counts the pairs into their tiles and orders each list by itself (`counting.py`): a radix sort's many launches
   cost more than its work, and Dr.Jit 1.5 cannot replay them.
-- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile (`pair_sort.py`); both sorts are stable.
+- LLVM sorts the splats by depth once, expands them to pairs, and sorts those by tile (`pair_sort.py`); both sorts are
+  stable.
 """
 
 from dataclasses import dataclass
