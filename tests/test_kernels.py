@@ -1,4 +1,5 @@
-"""Kernels of LLVM's text: what they compute, when they run, and that Dr.Jit's give the same to the bit."""
+"""Kernels of LLVM's text: what they compute, when they run, and that Dr.Jit's give the same lists and gradients, to the
+bit. The loss is in tests/splat/train/loss/."""
 
 import drjit as dr
 import numpy as np
@@ -16,7 +17,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists import bin as binning
 from spacesim.splat.raster.lists import pair_sort, record_copy
 from spacesim.splat.raster.project import Pinhole, project
-from spacesim.splat.train.loss import strips
+from spacesim.splat.train.loss import photometric_llvm
 
 pytestmark = pytest.mark.threads
 
@@ -162,7 +163,9 @@ def test_dr_jits_kernels_give_the_same_bits(size, count, channels, absolute, mon
         monkeypatch.setattr(module, "is_usable", lambda: False)
     for value, other in zip(ours, results(), strict=True):
         np.testing.assert_array_equal(value, other)
-    assert any(np.abs(value).max() > 0 for value in ours[7:])
+    gradients = ours[7 + channels + 1 :]
+    assert gradients
+    assert all(np.abs(value).max() > 0 for value in gradients)
 
 
 @pytest.mark.parametrize("threads", [1, 16, 64])
@@ -171,12 +174,16 @@ def test_no_bit_depends_on_the_number_of_threads(threads):
     count, size = 5000, (300, 90)
     view, rng = record("perspective", *size), np.random.default_rng(2)
     splats, footprints = project(Gaussians.from_numpy(random_splats(count, seed=3, degree=0)), Pinhole.of(view))
-    pictures = [ad.Array3f([upload(row) for row in rng.uniform(size=(3, 27000)).astype(np.float32)]) for _ in range(2)]
+    features = [upload(row) for row in rng.uniform(size=(3, count)).astype(np.float32)]
+    picture = ad.Array3f([upload(row) for row in rng.uniform(size=(3, size[0] * size[1])).astype(np.float32)])
 
     def results() -> list[np.ndarray]:
         lists = binning.bin_splats(splats, footprints, *size)
-        sums, gradient = strips.loss_and_gradient(*pictures, *size, 0.2)
-        return [np.array(value) for value in (lists.splat, lists.place, lists.end, sums, *gradient)]
+        blended = blend.forward(splats, features, lists, *size, adjoint=True)
+        sums, gradient = photometric_llvm.loss_and_gradient(ad.Array3f(blended.features), picture, *size, 0.2)
+        found = blend.backward(splats, blended, lists, size, list(gradient), blended.transmittance)
+        values = [getattr(found.splats, name) for name in slot_sums.SHAPE] + found.features
+        return [np.array(value) for value in (lists.splat, lists.place, lists.end, sums, *gradient, *values)]
 
     before, usual = results(), dr.thread_count()
     dr.set_thread_count(threads)
@@ -193,9 +200,9 @@ def test_literals_have_memory_of_their_own():
     rng, (width, height) = np.random.default_rng(3), (40, 30)
     prediction = ad.Array3f([upload(row) for row in rng.uniform(size=(3, width * height)).astype(np.float32)])
     whole = ad.Array3f([upload(np.full(width * height, value, np.float32)) for value in (0.1, 0.5, 0.9)])
-    expected, gradient = strips.loss_and_gradient(prediction, whole, width, height, 0.2)
+    expected, gradient = photometric_llvm.loss_and_gradient(prediction, whole, width, height, 0.2)
     literals = ad.Array3f([dr.full(ad.Float, value, width * height) for value in (0.1, 0.5, 0.9)])
     for target in (literals, ad.Array3f(0.1, 0.5, 0.9)):
-        sums, found = strips.loss_and_gradient(prediction, target, width, height, 0.2)
+        sums, found = photometric_llvm.loss_and_gradient(prediction, target, width, height, 0.2)
         np.testing.assert_array_equal(np.array(sums), np.array(expected))
         np.testing.assert_array_equal(np.array(found), np.array(gradient))

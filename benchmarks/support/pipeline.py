@@ -27,7 +27,8 @@ RECORDINGS = 8  #: kept of a stage
 class Pipeline:
     """Gaussians before a camera. Each method is a stage: it evaluates its results and leaves them for the next.
 
-    Stages of fixed shape (project, loss, update) are recorded and replayed, as the trainer does.
+    Stages of fixed shape (project, loss, update) are recorded and replayed, as the trainer does; on a CPU the loss is
+    not, whose kernel of text no recording takes in: the trainer has it between two, which compare the picture twice.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], camera: Camera) -> None:
@@ -39,7 +40,7 @@ class Pipeline:
         self.factors = ad.Float([1.0, 1.0, *[0.0] * len(self.gaussians.rows())])
         dr.eval(self.gaussians.rows(), self.optimizer.arrays, self.truth, self.factors)
         self._project = recorded(project_views, limit=RECORDINGS)
-        self._loss = _loss if is_usable() else recorded(_loss, limit=RECORDINGS)  # recordings take no text in
+        self._loss = _loss if is_usable() else recorded(_loss, limit=RECORDINGS)
         self._update = Update(antialiased=False, scale=1.0)
         for stage in (self.project, self.bin, self.forward, self.loss, self.backward, self.update):
             stage()

@@ -39,7 +39,7 @@ class LlvmKernel:
     ) -> None:
         """Raises RuntimeError where LLVM does not take the text, or what is needed is not there."""
         self._threads, self._size = _threads(), FIRST + len(arrays) + len(numbers) + len(stages)
-        self._is_of = len(arrays), len(numbers), len(stages)
+        self._takes = len(arrays), len(numbers), len(stages)
         functions = []
         for name, write in stages:
             text = Text(f"@{name}", arrays, numbers)
@@ -53,7 +53,7 @@ class LlvmKernel:
 
         counts: of the stages, above 0;  arrays: of Dr.Jit's, made opaque here, those to be written of `empty`
         """
-        assert (len(arrays), len(numbers), len(counts)) == self._is_of
+        assert (len(arrays), len(numbers), len(counts)) == self._takes
         threads = self._threads
         load_drjit().make_opaque(arrays)  # a literal has no memory of its own
         with one_at_a_time:

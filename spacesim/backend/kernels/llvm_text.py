@@ -71,8 +71,8 @@ class Text:
         self._addresses = {name: self._parameter("ptr", FIRST + i) for i, name in enumerate(arrays)}
         self._numbers = {name: self._parameter(INT, FIRST + len(arrays) + i) for i, name in enumerate(numbers)}
 
-    def first_of(self, names: Sequence[str], index: Value, name: str) -> None:
-        """Give a name to one of several arrays."""
+    def choose_array(self, name: str, names: Sequence[str], index: Value) -> None:
+        """From here on `name` is the array `index` of `names`."""
         address = self._addresses[names[-1]]
         for place in reversed(range(len(names) - 1)):
             address = (index < self.integer(place + 1)).choose(self._addresses[names[place]], address)

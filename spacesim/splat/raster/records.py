@@ -78,7 +78,7 @@ def pack_records(splats: Splats, features: list[Float], capacity: int) -> list[F
 
 
 def list_records(packed: list[Float], lists: TileLists, capacity: int) -> ListedRecords:
-    """packed: of `pack_records`, with this capacity"""
+    """Records as walks along the lists read them. packed: of `pack_records`, with this capacity"""
     if lists.capacity == 0:
         return ListedRecords([], capacity)
     dr.eval(packed)

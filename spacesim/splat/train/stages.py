@@ -276,7 +276,8 @@ def picture_loss(
         value = dr.detach(loss)
     else:
         sums, gradient = known
-        loss, value = dr.sum(compared.picture * gradient), dr.sum(sums)  # the first, of each pixel, has that gradient
+        loss, value = dr.sum(compared.picture * gradient), dr.sum(sums)
+        # that "loss", a number for each pixel, is no loss, but has its gradient
     for term in terms:
         value += dr.detach(term)
     for root in (loss, *terms):

@@ -29,7 +29,7 @@ from spacesim.splat.raster.seen import shown_splats
 from spacesim.splat.raster.supersample import upsampled_camera
 from spacesim.splat.train.async_lists import TrainingPairs, ViewPairs
 from spacesim.splat.train.config import TrainConfig
-from spacesim.splat.train.loss.strips import loss_and_gradient
+from spacesim.splat.train.loss.photometric_llvm import loss_and_gradient
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
     BlendTape,

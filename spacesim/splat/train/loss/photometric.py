@@ -1,9 +1,9 @@
 """L1 and structural dissimilarity of pictures (thesis 2.8; SSIM of Wang et al. 2004) with their derivative by hand.
 
-The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. On a CPU `strips` does all of
-it; else, and within recordings, three kernels follow that which writes the pictures: moments blurred along rows; those
-blurred along columns, SSIM, its derivatives by the moments, and these blurred along columns; those blurred along rows,
-and the gradient.
+The Gaussian window is separable and symmetric: the adjoint of a blur is the same blur. On a CPU all of it is
+`photometric_llvm`'s; else, and within recordings, three kernels follow that which writes the pictures: moments blurred
+along rows; those blurred along columns, SSIM, its derivatives by the moments, and these blurred along columns; those
+blurred along rows, and the gradient.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.blocks import new_block
 from spacesim.backend.kernels.llvm import is_usable
-from spacesim.splat.train.loss.strips import loss_and_gradient
+from spacesim.splat.train.loss.photometric_llvm import loss_and_gradient
 from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
 
 COLUMNS = 4  #: pixels of a row that a thread computes

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from spacesim.backend import ad, recorded, select
 from spacesim.backend.upload import upload
-from spacesim.splat.train.loss import photometric, strips
+from spacesim.splat.train.loss import photometric, photometric_llvm
 from spacesim.splat.train.loss.photometric import photometric_loss
 from spacesim.splat.train.stages import LossSettings, TargetImage, compared_pictures, picture_loss
 
@@ -104,8 +104,8 @@ def test_gradient_of_ssim_matches_central_differences():
 @pytest.mark.parametrize("size", [(1, 1), (3, 40), (33, 8), (50, 27), (70, 48), (34, 530)])
 def test_loss_and_gradient_equal_their_twin(monkeypatch, size, weight, way):
     """Of pictures smaller than the window, and of those that end within a thread's pixels."""
-    launched, kernel = [], strips._kernel
-    monkeypatch.setattr(strips, "_kernel", lambda: launched.append(True) or kernel())
+    launched, kernel = [], photometric_llvm._kernel
+    monkeypatch.setattr(photometric_llvm, "_kernel", lambda: launched.append(True) or kernel())
     if way == "Dr.Jit's":
         monkeypatch.setattr(photometric, "is_usable", lambda: False)
     rng = np.random.default_rng(5)

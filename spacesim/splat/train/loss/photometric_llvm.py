@@ -18,18 +18,18 @@ from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
 
 LANES = 16  #: pixels of a vector
 ROWS, COLUMNS = 32, 16  #: of a block; columns are vectors
-_FAR, _NEAR = ROWS + 4 * RADIUS, ROWS + 2 * RADIUS  # rows whose moments, whose derivatives a block needs
+_MOMENT_ROWS, _DERIVATIVE_ROWS = ROWS + 4 * RADIUS, ROWS + 2 * RADIUS  # that a block needs
 # Rows of a task's room, one behind the other: of the pictures and their products; of the moments, blurred along rows,
 # later the derivatives, blurred along columns; of the derivatives. To either side of a block's columns each has one
 # more, whose pixels beside the block are needed, and one of nothing.
 _MOMENTS, _DERIVATIVES = 4, 3  # x, y, x^2 + y^2, x y; by the means of x, of x^2 and of x y
 _BLURRED = _MOMENTS
-_PARTIALS = _BLURRED + _MOMENTS * _FAR
-_ROWS_OF_ROOM = _PARTIALS + _DERIVATIVES * _NEAR
+_PARTIALS = _BLURRED + _MOMENTS * _MOMENT_ROWS
+_ROOM_ROWS = _PARTIALS + _DERIVATIVES * _DERIVATIVE_ROWS
 _STRIDE = (COLUMNS + 4) * LANES
-_ROOM = _ROWS_OF_ROOM * _STRIDE
+_ROOM = _ROOM_ROWS * _STRIDE
 _PLANES = [[f"{name}{channel}" for channel in range(3)] for name in ("x", "y", "gradient")]
-_NUMBERS = "width", "height", "vectors", "across", "strips", "tasks", "l1", "ssim"
+_NUMBERS = "width", "height", "vectors", "across", "down", "tasks", "l1", "ssim"
 
 
 def loss_and_gradient(
@@ -37,15 +37,16 @@ def loss_and_gradient(
 ) -> tuple[Float, Array3f]:
     """`photometric_loss`, in parts to be added up, and its gradient by `prediction`."""
     count, vectors = width * height, -(-width // LANES)
-    across, strips = -(-vectors // COLUMNS), -(-height // ROWS)
-    tasks = min(dr.thread_count(), 3 * strips * across)
+    across, down = -(-vectors // COLUMNS), -(-height // ROWS)
+    blocks = 3 * across * down
+    tasks = min(dr.thread_count(), blocks)
     gradient = [empty(ad.Float, count) for _ in range(3)]
-    sums, room = empty(ad.Float, 3 * strips * across), empty(ad.Float, tasks * _ROOM)
+    sums, room = empty(ad.Float, blocks), empty(ad.Float, tasks * _ROOM)
     planes = [
         plane if dr.width(plane) == count else plane + dr.zeros(ad.Float, count) for plane in (*prediction, *target)
     ]
     shares = [float_bits(share / (3 * count)) for share in (1 - ssim_weight, ssim_weight)]
-    numbers = [width, height, vectors, across, strips, tasks, *shares]
+    numbers = [width, height, vectors, across, down, tasks, *shares]
     _kernel()([tasks], [*planes, *gradient, sums, room], numbers)
     return sums, ad.Array3f(gradient)
 
@@ -53,31 +54,30 @@ def loss_and_gradient(
 @cache
 def _kernel() -> LlvmKernel:
     arrays = [name for names in _PLANES for name in names]
-    return LlvmKernel([*arrays, "sums", "room"], _NUMBERS, ("strips", _write))
+    return LlvmKernel([*arrays, "sums", "room"], _NUMBERS, ("blocks", _write))
 
 
 def _write(text: Text) -> None:
-    across, strips = text.number("across"), text.number("strips")
+    across, blocks = text.number("across"), text.number("across") * text.number("down")
     room = text.index * _ROOM
     with text.loop(room, room + _ROOM, step=LANES) as loop:
         text.store("room", loop.at, text.zeros(LANES))
-    blocks = strips * across
     with text.loop(text.index, blocks * 3, step=text.number("tasks")) as turn:
         for names in _PLANES:
-            text.first_of(names, turn.at // blocks, names[0][:-1])
+            text.choose_array(names[0][:-1], names, turn.at // blocks)
         within = turn.at % blocks
         block = _Block(text, room, (within // across) * ROWS, (within % across) * COLUMNS)
-        with text.loop(text.integer(0), text.integer(_FAR)) as rows:
+        with text.loop(text.integer(0), text.integer(_MOMENT_ROWS)) as rows:
             block.blur_pictures(rows.at)
         with text.loop(block.around, block.around_end, [text.zeros(LANES)]) as columns:
-            with text.loop(text.integer(0), text.integer(_NEAR), columns.state) as rows:
+            with text.loop(text.integer(0), text.integer(_DERIVATIVE_ROWS), columns.state) as rows:
                 rows.following = [block.compare(columns.at, rows.at, rows.state[0])]
             columns.following = rows.state
             with text.loop(text.integer(0), text.integer(ROWS)) as rows:
                 block.blur_derivatives(columns.at, rows.at)
         with text.loop(text.integer(0), text.integer(ROWS), [text.zeros(LANES)]) as rows:
             for i in range(_DERIVATIVES):
-                block.end_row(rows.at + (_BLURRED + i * _FAR))
+                block.end_row(rows.at + (_BLURRED + i * _MOMENT_ROWS))
             with text.loop(block.left, block.right, rows.state) as along:
                 along.following = [block.write_gradient(along.at, rows.at, along.state[0])]
             rows.following = along.state
@@ -115,16 +115,16 @@ class _Block:
         with text.loop(self.around, self.around_end) as columns:
             for i in range(_MOMENTS):
                 blurred = self._blurred_along(text.integer(i), columns.at)
-                text.store("room", self._place(row + (_BLURRED + i * _FAR), columns.at), blurred)
+                text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), columns.at), blurred)
 
     def compare(self, column: Value, row: Value, total: Value) -> Value:
         """SSIM's derivatives, the first RADIUS above the block; 1 - SSIM of the block's pixels added to `total`."""
         text = self.text
-        means = [self._blurred_down(row + (_BLURRED + i * _FAR), column) for i in range(_MOMENTS)]
+        means = [self._blurred_down(row + (_BLURRED + i * _MOMENT_ROWS), column) for i in range(_MOMENTS)]
         value, *derivatives = _similarity(text, means)
         inside, nothing = self._inside(column, row - RADIUS), text.zeros(LANES)
         for i, derivative in enumerate(derivatives):
-            place = self._place(row + (_PARTIALS + i * _NEAR), column)
+            place = self._place(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column)
             text.store("room", place, inside.choose(derivative, nothing))
         dissimilarity = inside.choose(text.floats(LANES, 1) - value, nothing)
         for place, extent in ((row - RADIUS, text.integer(ROWS)), (column - self.left, text.integer(COLUMNS))):
@@ -134,15 +134,15 @@ class _Block:
     def blur_derivatives(self, column: Value, row: Value) -> None:
         """Along columns, of a row of the block; in the place of this column's moments."""
         for i in range(_DERIVATIVES):
-            blurred = self._blurred_down(row + (_PARTIALS + i * _NEAR), column)
-            self.text.store("room", self._place(row + (_BLURRED + i * _FAR), column), blurred)
+            blurred = self._blurred_down(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column)
+            self.text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), column), blurred)
 
     def write_gradient(self, column: Value, row: Value, total: Value) -> Value:
         """Of a row of the block; |x - y| added to `total`."""
         text = self.text
         inside, x, y = self._pixels(column, row)
         by_mean, by_square, by_product = (
-            self._blurred_along(row + (_BLURRED + i * _FAR), column) for i in range(_DERIVATIVES)
+            self._blurred_along(row + (_BLURRED + i * _MOMENT_ROWS), column) for i in range(_DERIVATIVES)
         )
         by_ssim = text.fma(y, by_product, text.fma(x + x, by_square, by_mean))
         difference = x - y
