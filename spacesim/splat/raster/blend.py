@@ -111,8 +111,8 @@ def blend_planes(
     finish: Finish,
     bucket: int | None = None,
 ) -> tuple[list[Float], BlendState | None]:
-    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. records:
-    of so many channels"""
+    """(planes of what `finish` makes of each pixel; what the adjoint reads), else as `blend_lists`. records: with
+    so many channels"""
     (width, height), shape = image_size, lists.shape
     assert not bucket or bucket % TURN[select()] == 0, "a bucket is some turns of the loop"
     walks = whole_lists(lists, channels)

@@ -142,9 +142,10 @@ def _sort(boxes: Boxes, limit: UInt32, capacities: Capacities, grid: Grid) -> Ti
     pairs, capacity, count = _expand(boxes, limit, capacities, grid), capacities.pairs, grid.tiles
     slot = _stable_order(pairs.tile, count.bit_length())
     splat = dr.gather(ad.UInt32, pairs.splat, slot)
-    end = segment_ids(pairs.tile, dr.arange(ad.UInt32, count), capacity, slot)
+    number = dr.arange(ad.UInt32, count)
+    end = segment_ids(pairs.tile, number, capacity, slot)
     dr.eval(end)
-    start = dr.gather(ad.UInt32, end, dr.arange(ad.UInt32, count) - 1, dr.arange(ad.UInt32, count) > 0)
+    start = dr.gather(ad.UInt32, end, number - 1, number > 0)
     order = _longest_first(start, end, grid)
     place = dr.empty(ad.UInt32, capacity)
     dr.scatter(place, dr.arange(ad.UInt32, capacity), slot)
