@@ -17,17 +17,26 @@ class Value:
     kind: str  #: of LLVM
     name: str  #: of LLVM, "%v1" or a constant's
 
-    def __add__(self, other: "Value | int") -> "Value":
+    def __add__(self, other: "Value | float") -> "Value":
         return self._with("add", other)
 
-    def __sub__(self, other: "Value | int") -> "Value":
+    def __sub__(self, other: "Value | float") -> "Value":
         return self._with("sub", other)
 
-    def __mul__(self, other: "Value | int") -> "Value":
+    def __mul__(self, other: "Value | float") -> "Value":
         return self._with("mul", other)
 
     def __truediv__(self, other: "Value") -> "Value":
         return self._with("div", other)
+
+    def __rmul__(self, other: float) -> "Value":
+        return self * other
+
+    def __rsub__(self, other: float) -> "Value":
+        return self.like(other) - self
+
+    def __neg__(self) -> "Value":
+        return self.text.value(self.kind, f"fneg {self.kind} {self.name}")
 
     def __floordiv__(self, other: "Value") -> "Value":
         return self.text.value(INT, f"udiv {INT} {self.name}, {other.name}")
@@ -44,10 +53,17 @@ class Value:
         """Of a condition, or one for each entry of a vector."""
         return self.text.value(yes.kind, f"select {self.kind} {self.name}, {yes.kind} {yes.name}, {no.kind} {no.name}")
 
-    def _with(self, operation: str, other: "Value | int") -> "Value":
-        second = other.name if isinstance(other, Value) else str(other)
+    def _with(self, operation: str, other: "Value | float") -> "Value":
         prefix = "" if self.kind == INT else "f"
-        return self.text.value(self.kind, f"{prefix}{operation} {self.kind} {self.name}, {second}")
+        return self.text.value(self.kind, f"{prefix}{operation} {self.kind} {self.name}, {self.like(other).name}")
+
+    def like(self, other: "Value | float") -> "Value":
+        """A number as a constant of this kind."""
+        if isinstance(other, Value):
+            return other
+        if self.kind == INT:
+            return self.text.integer(int(other))
+        return self.text.one_float(other) if self.kind == FLOAT else self.text.floats(_size(self.kind), other)
 
     def least(self, other: "Value") -> "Value":
         """The smaller of two integers that are not negative."""
@@ -171,10 +187,10 @@ class Text:
         address = self._addresses[array].name
         return self.value("ptr", f"getelementptr {kind}, ptr {address}, {INT} {index.name}").name
 
-    def fma(self, x: Value, y: Value, z: Value) -> Value:
+    def fma(self, x: Value, y: Value | float, z: Value | float) -> Value:
         """x y + z, rounded once."""
         name = f"v{_size(x.kind)}f32" if x.kind != FLOAT else "f32"
-        arguments = ", ".join(f"{value.kind} {value.name}" for value in (x, y, z))
+        arguments = ", ".join(f"{value.kind} {value.name}" for value in (x, x.like(y), x.like(z)))
         return self.value(x.kind, f"call {x.kind} @llvm.fma.{name}({arguments})")
 
     def sum(self, value: Value) -> Value:

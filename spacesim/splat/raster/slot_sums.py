@@ -71,14 +71,14 @@ def _write(sizes: list[int], channels: int, absolute: bool, text: Text) -> None:
         values = {
             "x": text.fma(a, sx, b * sy),
             "y": text.fma(b, sx, c * sy),
-            "a": sxx * text.one_float(-0.5),
-            "b": sxy * text.one_float(-1),
-            "c": syy * text.one_float(-0.5),
+            "a": sxx * -0.5,
+            "b": -sxy,
+            "c": syy * -0.5,
             "opacity": s0 * (text.one_float(1) / text.largest(opacity, text.one_float(1e-30))),
         }
         if absolute:
             for name in ("absolute_x", "absolute_y"):
-                values[name] = rest.pop(0) * text.one_float(math.log(2))  # records are in units of log2 e
+                values[name] = rest.pop(0) * math.log(2)  # records are in units of log2 e
         values |= {f"feature{i}": rest[i] for i in range(channels)}
         for name, value in values.items():
             text.store(name, splat, value)

@@ -7,6 +7,7 @@ blurred along rows, and the gradient.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import cast
 
 import drjit as dr
@@ -16,7 +17,7 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.backend.blocks import new_block
 from spacesim.backend.kernels.llvm import is_usable
 from spacesim.splat.train.loss.photometric_llvm import loss_and_gradient
-from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
+from spacesim.splat.train.loss.window import RADIUS, blurred, similarity
 
 COLUMNS = 4  #: pixels of a row that a thread computes
 ROWS = 16  #: pixels of a column that a thread computes
@@ -102,10 +103,13 @@ def _partials(strips: "_Strips", moments: list[Float]) -> tuple[list[Float], Flo
     thread = dr.arange(ad.UInt32, 3 * strips.down * strips.stride)
     column, strip = thread % strips.stride, thread // strips.stride
     channel, first = strip // strips.down, (strip % strips.down) * ROWS
-    blurred = [_blur(values) for values in strips.read_moments(moments, channel, first, column)]
+    means = [_blur(values) for values in strips.read_moments(moments, channel, first, column)]
     rows = _neighbours(first, range(-RADIUS, ROWS + RADIUS), strips.height)
     inside = [active & (column < strips.width) for _, active in rows]
-    pixels = [_similarity(means, active) for means, active in zip(_transposed(blurred), inside, strict=True)]
+    pixels = [
+        similarity(of_pixel, partial(_only, active), dr.fma, dr.rcp)
+        for of_pixel, active in zip(_transposed(means), inside, strict=True)
+    ]
     dissimilarity = ad.Float(0)
     for (value, *_), active in list(zip(pixels, inside, strict=True))[RADIUS:-RADIUS]:
         dissimilarity += dr.select(active, 1 - value, 0)
@@ -119,29 +123,17 @@ def _partials(strips: "_Strips", moments: list[Float]) -> tuple[list[Float], Flo
     return partials, dissimilarity
 
 
-def _similarity(means: Sequence[Float], inside: Bool) -> tuple[Float, Float, Float, Float]:
-    """SSIM of a pixel from the means of x, y, x^2 + y^2 and x y under its window, and its derivatives by those of x,
-    x^2 and x y (the first with the window's other means held); all 0 where not `inside`."""
-    mx, my, squares, product = means
-    mxy, mm = mx * my, dr.fma(mx, mx, my * my)
-    a1, a2 = 2 * mxy + C1, 2 * (product - mxy) + C2
-    r1, r2 = dr.rcp(mm + C1), dr.rcp(squares - mm + C2)
-    inverse = dr.select(inside, r1 * r2, 0)
-    value = a1 * a2 * inverse
-    grad_mean = 2 * my * (a2 - a1) * inverse + 2 * mx * value * (r2 - r1)
-    return value, grad_mean, -value * r2, 2 * a1 * inverse
+def _only(active: Bool, value: Float) -> Float:
+    """0 where not `active`."""
+    return dr.select(active, value, 0)
 
 
 def _blur(values: Sequence[Float]) -> list[Float]:
-    """Of neighbours, the blurred ones but RADIUS at each end. The window is symmetric: two neighbours meet before they
-    are weighed, and sums and products run side by side."""
+    """Of neighbours, the blurred ones but RADIUS at each end."""
     result = []
     for j in range(RADIUS, len(values) - RADIUS):
         new_block()
-        total = values[j] * WINDOW[RADIUS]
-        for k in range(1, RADIUS + 1):
-            total = dr.fma(values[j - k] + values[j + k], WINDOW[RADIUS + k], total)
-        result.append(total)
+        result.append(blurred(values[j - RADIUS : j + RADIUS + 1], dr.fma))
     return result
 
 

@@ -14,7 +14,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.backend.kernels.llvm import LlvmKernel, empty
 from spacesim.backend.kernels.llvm_text import Text, Value, float_bits
-from spacesim.splat.train.loss.window import C1, C2, RADIUS, WINDOW
+from spacesim.splat.train.loss.window import RADIUS, blurred, similarity
 
 LANES = 16  #: pixels of a vector
 ROWS, COLUMNS = 32, 16  #: of a block; columns are vectors
@@ -114,19 +114,20 @@ class _Block:
             self.end_row(text.integer(i))
         with text.loop(self.around, self.around_end) as columns:
             for i in range(_MOMENTS):
-                blurred = self._blurred_along(text.integer(i), columns.at)
-                text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), columns.at), blurred)
+                moment = self._blurred_along(text.integer(i), columns.at)
+                text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), columns.at), moment)
 
     def compare(self, column: Value, row: Value, total: Value) -> Value:
         """SSIM's derivatives, the first RADIUS above the block; 1 - SSIM of the block's pixels added to `total`."""
         text = self.text
         means = [self._blurred_down(row + (_BLURRED + i * _MOMENT_ROWS), column) for i in range(_MOMENTS)]
-        value, *derivatives = _similarity(text, means)
         inside, nothing = self._inside(column, row - RADIUS), text.zeros(LANES)
+        value, *derivatives = similarity(
+            means, lambda inverse: inside.choose(inverse, nothing), text.fma, lambda x: text.floats(LANES, 1) / x
+        )
         for i, derivative in enumerate(derivatives):
-            place = self._place(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column)
-            text.store("room", place, inside.choose(derivative, nothing))
-        dissimilarity = inside.choose(text.floats(LANES, 1) - value, nothing)
+            text.store("room", self._place(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column), derivative)
+        dissimilarity = inside.choose(1 - value, nothing)
         for place, extent in ((row - RADIUS, text.integer(ROWS)), (column - self.left, text.integer(COLUMNS))):
             dissimilarity = (place < extent).choose(dissimilarity, nothing)  # what is before the block is below 0
         return total + dissimilarity
@@ -134,8 +135,8 @@ class _Block:
     def blur_derivatives(self, column: Value, row: Value) -> None:
         """Along columns, of a row of the block; in the place of this column's moments."""
         for i in range(_DERIVATIVES):
-            blurred = self._blurred_down(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column)
-            self.text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), column), blurred)
+            derivative = self._blurred_down(row + (_PARTIALS + i * _DERIVATIVE_ROWS), column)
+            self.text.store("room", self._place(row + (_BLURRED + i * _MOMENT_ROWS), column), derivative)
 
     def write_gradient(self, column: Value, row: Value, total: Value) -> Value:
         """Of a row of the block; |x - y| added to `total`."""
@@ -144,7 +145,7 @@ class _Block:
         by_mean, by_square, by_product = (
             self._blurred_along(row + (_BLURRED + i * _MOMENT_ROWS), column) for i in range(_DERIVATIVES)
         )
-        by_ssim = text.fma(y, by_product, text.fma(x + x, by_square, by_mean))
+        by_ssim = text.fma(y, by_product, text.fma(2 * x, by_square, by_mean))
         difference = x - y
         sign = (difference < text.zeros(LANES)).choose(text.floats(LANES, -1), text.floats(LANES, 1))  # as Dr.Jit's
         l1, ssim = (text.spread(text.float_number(name), LANES) for name in ("l1", "ssim"))
@@ -173,31 +174,11 @@ class _Block:
     def _blurred_along(self, row: Value, column: Value) -> Value:
         """Of the room."""
         place = self._place(row, column)
-        return self._blurred([place + k if k >= 0 else place - -k for k in range(-RADIUS, RADIUS + 1)])
+        return self._blurred([place + k for k in range(-RADIUS, RADIUS + 1)])
 
     def _blurred_down(self, row: Value, column: Value) -> Value:
         """Of the room's rows, 2 RADIUS + 1 from `row` on."""
         return self._blurred([self._place(row + k, column) for k in range(2 * RADIUS + 1)])
 
     def _blurred(self, places: Sequence[Value]) -> Value:
-        """As in `photometric`."""
-        values = [self.text.load_floats("room", place, LANES) for place in places]
-        weights = [self.text.floats(LANES, weight) for weight in WINDOW]
-        total = values[RADIUS] * weights[RADIUS]
-        for k in range(1, RADIUS + 1):
-            total = self.text.fma(values[RADIUS - k] + values[RADIUS + k], weights[RADIUS + k], total)
-        return total
-
-
-def _similarity(text: Text, means: Sequence[Value]) -> tuple[Value, Value, Value, Value]:
-    """As in `photometric`."""
-    (mx, my, squares, product), one = means, text.floats(LANES, 1)
-    c1, c2 = text.floats(LANES, C1), text.floats(LANES, C2)
-    mxy, mm = mx * my, text.fma(mx, mx, my * my)
-    rest = product - mxy
-    a1, a2 = mxy + mxy + c1, rest + rest + c2
-    r1, r2 = one / (mm + c1), one / (squares - mm + c2)
-    inverse = r1 * r2
-    value = a1 * a2 * inverse
-    grad_mean = (my + my) * (a2 - a1) * inverse + (mx + mx) * value * (r2 - r1)
-    return value, grad_mean, text.zeros(LANES) - value * r2, (a1 + a1) * inverse
+        return blurred([self.text.load_floats("room", place, LANES) for place in places], self.text.fma)
