@@ -21,6 +21,7 @@ from spacesim.splat.raster.project import Footprints, Splats
 MAX_LANES = 32  #: threads that share a splat's pairs: a warp
 MANY = 256  #: tiles of a box; one of more is a large splat's
 LANES_OF_LARGE = 1024  #: threads that share a large splat's pairs; `round_capacity` gives multiples of as many
+NEVER = 2**32 - 1  #: a turn that no thread has
 Visit = Callable[[UInt32, UInt32], None]
 """(number of a pair within its splat's box, its tile, the number of tiles where it is in none)."""
 
@@ -130,7 +131,8 @@ def _each_pair(
     assert large is not None
     assert boxes.large_count is not None
     large_count = dr.select(fit, dr.gather(ad.UInt32, boxes.large_count, ad.UInt32(0)), 0)
-    group, groups = thread // LANES_OF_LARGE, capacity * lanes // LANES_OF_LARGE
+    # by the splats that there are: by the capacity, a literal, each would be compiled
+    group, groups = thread // LANES_OF_LARGE, dr.maximum(boxes.splats * lanes // LANES_OF_LARGE, 1)
 
     def has_more(turn: UInt32) -> Bool:
         return turn <= large_count
@@ -143,7 +145,7 @@ def _each_pair(
         pairs = dr.select(~own | (fit & (pairs <= MANY) & (number < boxes.splats)), pairs, 0)
         lane, step = dr.select(own, thread % lanes, thread % LANES_OF_LARGE), dr.select(own, lanes, LANES_OF_LARGE)
         each_tile(load(boxes.records, splat, capacity), pairs, lane, ad.UInt32(step), grid, visit_of(splat))
-        return (turn + dr.select(own, 1 + group, groups),)
+        return (dr.select(own, dr.select(group < groups, 1 + group, NEVER), turn + groups),)
 
     dr.while_loop((ad.UInt32(0),), has_more, visit, mode="symbolic", label="tiles of splats")
 
