@@ -222,7 +222,7 @@ def train_gsplat(schedule: Trainer, start: dict[str, np.ndarray], config: TrainC
             "sh0": splats["sh0"],
             "shN": splats["shN"],
         }
-        degree = min(config.sh_degree, index // config.sh_every)
+        degree = config.degree(index)
         image, alpha, info = rasterize(renamed, view.camera, degree, "RGB", absgrad=True)
         strategy.step_pre_backward(splats, optimizers, state, index, info)
         rgba = torch.tensor(view.rgba.view(np.uint8).reshape(view.camera.height, view.camera.width, 4), device="cuda")

@@ -105,7 +105,7 @@ class TrainConfig:
     init_count: int = 20_000  #: Gaussians at the start, at most, and no more than refinement.max_gaussians
     splatfacto_start: bool = False  #: turned at random; `random` fills 10 scene scales, in greys: as splatfacto starts
     sh_degree: int = 3  #: of spherical harmonics, of `vanilla`; 0 to 3
-    sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins
+    sh_every: int = 1_000  #: iterations after which one more degree of spherical harmonics joins; 0: all at once
     ssim_weight: float = 0.2  #: share of D-SSIM in the loss beside L1, lambda of thesis 2.8
     random_background: bool = True  #: each step over another colour, by alpha; false: over black, as 2.16 is printed
     random_behind_opaque: bool = False  #: also behind pictures without alpha, as splatfacto: their sky is modelled, too
@@ -156,7 +156,7 @@ class TrainConfig:
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, found {getattr(self, name)}")
         check_ranges(self, views_per_step=(1, MAX_VIEWS), sh_degree=(0, 3), supersample=(1, MAX_SUPERSAMPLE))
-        check_ranges(self, iterations=(1, MAX_STEPS), sh_every=(1, MAX_STEPS), checkpoint_every=(1, MAX_STEPS))
+        check_ranges(self, iterations=(1, MAX_STEPS), sh_every=(0, MAX_STEPS), checkpoint_every=(1, MAX_STEPS))
         check_ranges(self, num_downscales=(0, MOST_DOWNSCALES), resolution_schedule=(1, MAX_STEPS))
         if self.means_steps is not None:
             check_ranges(self, means_steps=(1, MAX_STEPS))
@@ -204,6 +204,10 @@ class TrainConfig:
             return False
         refinement = replace(self.refinement, refine_stop=self.refine_stop)
         return any(refinement.refines_at(step) for step in range(0, self.refine_stop, refinement.refine_every))
+
+    def degree(self, step: int) -> int:
+        """Of the harmonics that are drawn at `step`, the first of which is 0."""
+        return min(self.sh_degree, step // self.sh_every) if self.sh_every else self.sh_degree
 
     def downscale(self, step: int) -> int:
         """How many pixels of a picture make one, on a side, at `step`, the first of which is 0 (as splatfacto)."""

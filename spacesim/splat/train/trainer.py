@@ -126,7 +126,7 @@ class Trainer(TrainingLoop):
     def step(self) -> Float:
         """One update from one view or several, densification if it is time. Returns the mean loss, Float of width 1."""
         config, index, count = self.config, self.iteration, self.config.views_per_step
-        degree = min(config.sh_degree, index // config.sh_every)
+        degree = config.degree(index)
         numbers = range(index * count, (index + 1) * count)
         # all are read before anything changes: one that cannot be leaves the state as it was
         views = [self.pictures.taught(self.views, number, index) for number in numbers]

@@ -31,9 +31,9 @@ from spacesim.splat.train.train import train
 OLD = json.loads((Path(__file__).parent / "older_configs.json").read_text(encoding="utf-8"))
 """{preset, method and strategy: its config.json} in the older form, with the settings of all strategies."""
 DIGESTS = {
-    "demo": "fe6559052c6d7fbd",
-    "fast": "b29f25c62722d332",
-    "fine": "c6875fbd7db58085",
+    "demo": "d8913a1cba5f6509",
+    "fast": "e5ff0d8e71c3c67a",
+    "fine": "efd21b62cd5ddefa",
     "thesis": "edb72c435b0398fb",
 }
 """Of these methods and strategies of a preset: a change here changes trained models."""
@@ -47,6 +47,7 @@ def as_it_was(config: TrainConfig) -> TrainConfig:
     """What that run has, and the preset has not."""
     if config.preset == "thesis":
         return thesis_as_it_was(config)
+    config = replace(config, sh_every=600 if config.preset == "demo" else 1_000)
     if config.method == "vanilla":
         rates = {"rates.sh_rest": 1.25e-4, "rates.decay": "exponential"}
         return with_settings(config, {**rates, "antialiased": False, "surfels": False})
@@ -299,7 +300,7 @@ def test_a_shorter_training_shortens_its_schedule():
     config = replace(preset("fast", strategy="support-aware"), warm_start=warm_start("fast"))
     short, before = shortened(config, 700), config.refinement
     after = short.refinement
-    assert (short.iterations, short.sh_every) == (700, config.sh_every // 10)
+    assert (short.iterations, short.sh_every) == (700, 0)
     assert (after.refine_start, after.pause_after_reset, after.refine_stop) == (50, 100, 500)
     names = ("refine_every", "reset_every", "screen_size_stop", "max_gaussians")
     assert [getattr(after, name) for name in names] == [getattr(before, name) for name in names]
@@ -307,7 +308,12 @@ def test_a_shorter_training_shortens_its_schedule():
     assert (short.warm_start.steps, short.warm_start.decay, short.warm_start.conservative) == (100, 100, 50)
     assert shortened(config, 14_000) == replace(config, iterations=14_000)
     assert with_options(config, iterations=700) == short
-    assert shortened(config, 1).sh_every == 1
+    assert (shortened(config, 1).sh_every, shortened(replace(config, sh_every=600), 1).sh_every) == (0, 1)
+
+
+def test_degrees_of_harmonics_join_one_by_one_or_all_at_once():
+    assert [TrainConfig(sh_every=20).degree(step) for step in (0, 19, 20, 60, 1000)] == [0, 0, 1, 3, 3]
+    assert [TrainConfig(sh_every=0, sh_degree=2).degree(step) for step in (0, 1, 1000)] == [2, 2, 2]
 
 
 @pytest.mark.parametrize(("name", "shortest"), [("demo", 300), ("fast", 300), ("fine", 1000), ("thesis", 300)])
