@@ -4,7 +4,7 @@ A tensor core multiplies numbers of TF32: 11 bits, and the exponent of float32. 
 + a2 but for its last bits, and a product ab is a1 b1 + a1 b2 + a2 b1 (Ootomo and Yokota 2022); infinity gives NaN. What
 it adds up it cuts off rather than rounds, so it adds up `DEPTH` products, and these sums are added up in float32.
 
-A block has a tile of `ROWS` x `COLUMNS` of the result; tiles of both factors come `DEPTH` columns and rows at a time to
+A block has a tile of the result (`SIZES`); tiles of both factors come `DEPTH` columns and rows at a time to
 shared memory, while the last ones are multiplied. Which thread holds which entries: PTX ISA, "mma.m16n8k8".
 """
 
@@ -15,11 +15,11 @@ from typing import Literal
 
 from spacesim.learning.networks.network import CHUNK
 
-ROWS, COLUMNS = 128, 64  #: of the result, a block
+SIZES = {"hidden": (64, 128), "back": (64, 128), "outer": (128, 64)}  #: rows and columns of the result, a block
 DEPTH = 32  #: columns of the first factor, rows of the second, that are in shared memory at once
 STAGES = 2  #: of them, so many times: some are on their way
 WARP_ROWS, WARP_COLUMNS = 64, 32  #: of the result, a warp
-THREADS = ROWS // WARP_ROWS * (COLUMNS // WARP_COLUMNS) * 32  #: of a block
+THREADS = 128  #: of a block: the warps of any of `SIZES`
 BLOCKS = 2  #: at a time on a multiprocessor, at least
 ADDRESSES, NUMBERS = 4, 5  #: parameters
 COPIED, BYTES = 4, 4  #: numbers that are copied at once; bytes of a number
@@ -79,8 +79,9 @@ class ProductText:
         self.entry = f"{kind}_masked" if masked else kind
         self._lines: list[str] = []
         self._counts = dict.fromkeys(_TYPES, 0)
-        first = _Tile(kind != "back", ROWS, 0)
-        self._tiles = first, _Tile(kind == "outer", COLUMNS, first.bytes)
+        self._height, self._width = SIZES[kind]
+        first = _Tile(kind != "back", self._height, 0)
+        self._tiles = first, _Tile(kind == "outer", self._width, first.bytes)
         self._stage = sum(tile.bytes for tile in self._tiles)
 
     @property
@@ -91,8 +92,8 @@ class ProductText:
     def grid(self, rows: int, columns: int, batch: int, parts: int) -> tuple[int, int, int]:
         """Blocks for M, N, B, G."""
         if self.kind == "outer":
-            return -(-rows // ROWS), -(-columns // COLUMNS), parts
-        return -(-rows // ROWS) * batch * (CHUNK // COLUMNS), 1, 1
+            return -(-rows // self._height), -(-columns // self._width), parts
+        return -(-rows // self._height) * batch * (CHUNK // self._width), 1, 1
 
     @cached_property
     def text(self) -> str:
@@ -145,13 +146,13 @@ class ProductText:
             row, column, self._part = block
             self._split(batch, parts)
         else:
-            above = self._make("div.u32", self._make("add.u32", self._rows, ROWS - 1), ROWS)
+            above = self._make("div.u32", self._make("add.u32", self._rows, self._height - 1), self._height)
             row, place = self._make("rem.u32", block[0], above), self._make("div.u32", block[0], above)
-            self._matrix = self._make("div.u32", place, CHUNK // COLUMNS)
-            column = self._make("rem.u32", place, CHUNK // COLUMNS)
+            self._matrix = self._make("div.u32", place, CHUNK // self._width)
+            column = self._make("rem.u32", place, CHUNK // self._width)
             self._length, self._start = self._depth, "0"
-        self._row = self._make("mul.lo.u32", row, ROWS)  # first ones of the block's
-        self._column = self._make("mul.lo.u32", column, COLUMNS)
+        self._row = self._make("mul.lo.u32", row, self._height)  # first ones of the block's
+        self._column = self._make("mul.lo.u32", column, self._width)
         self._multiply(self._copies())
 
     def _split(self, batch: str, parts: str) -> None:
@@ -225,7 +226,7 @@ class ProductText:
         stage_read, step = self._make("mov.u32", 0), self._make("mov.u32", 0)
         lane, warp = self._make("and.b32", self._thread, 31), self._make("shr.u32", self._thread, 5)
         group, self._pair = self._make("shr.u32", lane, 2), self._make("and.b32", lane, 3)
-        across = COLUMNS // WARP_COLUMNS
+        across = self._width // WARP_COLUMNS
         self._warp = [
             self._make("mul.lo.u32", self._make("div.u32", warp, across), WARP_ROWS),
             self._make("mul.lo.u32", self._make("rem.u32", warp, across), WARP_COLUMNS),
