@@ -69,7 +69,7 @@ def _peak() -> int:
 def over_steps(steps: int, marks: int = 10) -> list[Row]:
     """Train `steps` steps with refinement going on to the end; a row at each of `marks` moments."""
     count, pixels = SCENE
-    config = replace(preset("fast"), iterations=steps, init_count=count, sh_every=max(steps // 20, 1))
+    config = replace(preset("fast"), iterations=steps, init_count=count)
     refinement = replace(config.refinement, refine_stop=steps + 1, max_gaussians=MAX_GAUSSIANS, screen_size_stop=steps)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:

@@ -52,8 +52,7 @@ def write_dataset(root: Path, count: int, pixels: int, views: int = VIEWS) -> Da
 def still_trainer(
     dataset: Dataset, count: int, arrays: dict[str, np.ndarray] | None = None, base: TrainConfig | None = None
 ) -> Trainer:
-    """A trainer whose steps are whole but move nothing and refine nothing, all harmonics from its fourth step on, on
-    pictures of full size.
+    """A trainer whose steps are whole but move and refine nothing, with all harmonics, on pictures of full size.
 
     It holds the splats in `arrays`, or starts from the `count` points: opacity 0.1, as wide as their spacing.
     base: whose other settings count, by default those of `TrainConfig`
@@ -64,7 +63,7 @@ def still_trainer(
         init="points",
         init_count=count,
         splatfacto_start=False,
-        sh_every=1,
+        sh_every=0,
         num_downscales=0,
         rates=STILL,
         refinement=DensificationConfig(refine_start=NEVER, refine_stop=NEVER, max_gaussians=count),

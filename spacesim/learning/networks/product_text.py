@@ -11,15 +11,17 @@ shared memory, while the last ones are multiplied. Which thread holds which entr
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 from typing import Literal
 
 from spacesim.learning.networks.network import CHUNK
 
-SIZES = {"hidden": (64, 128), "back": (64, 128), "outer": (128, 64)}  #: rows and columns of the result, a block
+_SIDES = 64, 128
+SIZES = {"hidden": _SIDES, "back": _SIDES, "outer": _SIDES[::-1]}  #: rows and columns of the result, a block
 DEPTH = 32  #: columns of the first factor, rows of the second, that are in shared memory at once
 STAGES = 2  #: of them, so many times: some are on their way
 WARP_ROWS, WARP_COLUMNS = 64, 32  #: of the result, a warp
-THREADS = 128  #: of a block: the warps of any of `SIZES`
+THREADS = prod(_SIDES) // (WARP_ROWS * WARP_COLUMNS) * 32  #: of a block
 BLOCKS = 2  #: at a time on a multiprocessor, at least
 ADDRESSES, NUMBERS = 4, 5  #: parameters
 COPIED, BYTES = 4, 4  #: numbers that are copied at once; bytes of a number
