@@ -23,7 +23,7 @@ _FUNCTIONS = "task_submit_dep", "task_wait", "task_release"  # of Dr.Jit's threa
 _DONE = len(_FUNCTIONS)  # place of a parameter: 1 when all is done
 assert FIRST == _DONE + 1
 _BACKEND = 2  # LLVM, among Dr.Jit's
-_ENQUEUE = "_Z21jit_enqueue_host_func10JitBackendPFvPvES0_"
+_ENQUEUE, _WIDTH = "_Z21jit_enqueue_host_func10JitBackendPFvPvES0_", "_Z21jit_llvm_vector_widthv"
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +73,11 @@ def empty(kind: Any, size: int) -> Any:
     array = load_drjit().empty(kind, size)
     load_drjit().make_opaque(array)
     return array
+
+
+def vector_width() -> int:
+    """Numbers of a register: 4 of NEON, 8 of AVX2, 16 of AVX-512. Raises RuntimeError where kernels do not run."""
+    return _threads().vector_width
 
 
 def is_usable() -> bool:
@@ -148,7 +153,7 @@ class _Threads:
             raise RuntimeError("Dr.Jit's library is not known")
         try:
             pool = ctypes.CDLL(str(Path(library._name).with_name(f"libnanothread{Path(library._name).suffix}")))
-            self.enqueue = library[_ENQUEUE]
+            self.enqueue, self.vector_width = library[_ENQUEUE], int(library[_WIDTH]())
             found = [pool[name] for name in _FUNCTIONS]
         except (OSError, AttributeError) as error:
             raise RuntimeError(str(error)) from None

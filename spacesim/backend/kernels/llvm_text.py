@@ -179,6 +179,28 @@ class Text:
             kind, name = "i32", self.value("i32", f"trunc {INT} {name} to i32").name
         self.do(f"store {kind} {name}, ptr {self._place(array, index, 'i32')}, align 4")
 
+    def room(self, name: str, size: int) -> None:
+        """From here on `name` is an array of so many float32 of this call's own, on the stack."""
+        assert self._block == "entry", "taken once, not in each turn of a loop"
+        self._addresses[name] = self.value("ptr", f"alloca [{size} x {FLOAT}], align 64")
+
+    def transposed(self, rows: Sequence[Value]) -> list[Value]:
+        """As many vectors of float32 as each has entries, a power of two, as a matrix on its side."""
+        size, vectors, distance = len(rows), list(rows), 1
+        while distance < size:
+            first = [lane if not lane & distance else lane - distance + size for lane in range(size)]
+            second = [lane + distance if not lane & distance else lane + size for lane in range(size)]
+            for i in (i for i in range(size) if not i & distance):
+                pair = vectors[i], vectors[i + distance]
+                vectors[i], vectors[i + distance] = self._shuffled(*pair, first), self._shuffled(*pair, second)
+            distance *= 2
+        return vectors
+
+    def _shuffled(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
+        """A vector of entries of two, numbered one after the other."""
+        places = f"<{len(lanes)} x i32> <{', '.join(f'i32 {lane}' for lane in lanes)}>"
+        return self.value(x.kind, f"shufflevector {x.kind} {x.name}, {y.kind} {y.name}, {places}")
+
     def prefetch(self, array: str, index: Value) -> None:
         """Ask the memory for an entry that will be loaded."""
         self.do(f"call void @llvm.prefetch.p0(ptr {self._place(array, index, FLOAT)}, i32 0, i32 3, i32 1)")

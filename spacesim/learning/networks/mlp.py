@@ -11,6 +11,7 @@ from spacesim.backend.arrays import Float, TensorXf
 from spacesim.learning.networks import warps
 from spacesim.learning.networks.network import (
     InputLayer,
+    Launched,
     MlpShape,
     MlpTape,
     PartialLayer,
@@ -38,20 +39,21 @@ def forward(
     shared: Float,
     first_layer: PartialLayer | None = None,
     input_layer: InputLayer | None = None,
-    hidden: MlpTape | None = None,
+    launched: Launched | None = None,
 ) -> tuple[list[Float], MlpTape]:
     """(outputs, [N] each, the tape that `backward` wants): ReLU between layers, nothing after the last.
 
     weights: as `initial_weights` orders them, Float each;  items: TensorXf [B, `shape.rows`, m], finite everywhere, m a
     multiple of 8, on CUDA of 128;
     shared: Float [shared];  first_layer: where there is some, items are the other inputs alone, and the tape is of no
-    use;  input_layer: of the tape of other items with the same weights, and what they share;  hidden: what hidden
-    layers say of these items, where they have been computed
+    use;  input_layer: of the tape of other items with the same weights, and what they share;  launched: of these items,
+    if some is
     """
-    if hidden is not None:
-        tape, input_layer = [*hidden.values], hidden.input_layer
-    else:
-        tape = [items]
+    tape = [items]
+    if launched is not None:
+        if launched.outputs is not None:
+            return [row_of(launched.outputs, i) for i in range(shape.outputs)], launched.tape
+        tape, input_layer = [*launched.tape.values], launched.tape.input_layer
     if input_layer is None:
         input_layer = make_input_layer(shape, weights, shared, first_layer.inputs if first_layer else 0)
     by_warps = select() == "cuda" and first_layer is None

@@ -88,6 +88,14 @@ class MlpTape:
 
 
 @dataclass
+class Launched:
+    """What kernels launched before a recording (`fused`, `tensor_cores`) have made of items."""
+
+    tape: MlpTape  #: as far as they have come
+    outputs: TensorXf | None  #: [B, outputs, m]; None: of hidden layers alone
+
+
+@dataclass
 class WayBack:
     """What `mlp.backward_together` takes of each network."""
 

@@ -16,7 +16,7 @@ from spacesim.backend.arrays import Float, TensorXf
 from spacesim.backend.kernels.ptx import PtxKernel
 from spacesim.backend.upload import upload
 from spacesim.learning.networks import warps
-from spacesim.learning.networks.network import ALIGNED, CHUNK, InputLayer, MlpShape, MlpTape
+from spacesim.learning.networks.network import ALIGNED, CHUNK, InputLayer, Launched, MlpShape, MlpTape
 from spacesim.learning.networks.product_text import ADDRESSES, NUMBERS, THREADS, Kind, ProductText
 
 WIDE = 128  #: units of a hidden layer from which on it pays
@@ -35,12 +35,12 @@ def takes(shape: MlpShape, columns: int) -> bool:
     return wide and fits and select() == "cuda" and not dr.flag(dr.JitFlag.FreezingScope) and is_usable()
 
 
-def hidden_layers(shape: MlpShape, weights: list[Float], items: TensorXf, first: InputLayer) -> MlpTape:
-    """What hidden layers say of the items [B, `shape.rows`, m], as `mlp.forward` has it. first: the first layer"""
+def forward(shape: MlpShape, weights: list[Float], items: TensorXf, first: InputLayer) -> Launched:
+    """Hidden layers, of the items [B, `shape.rows`, m]. first: the first layer"""
     values = [items, _hidden(first.matrix.array, first.bias, items)]
     for i in range(1, shape.layers - 1):
         values.append(_hidden(weights[1 + 2 * i], weights[2 + 2 * i], values[-1]))
-    return MlpTape(values, first)
+    return Launched(MlpTape(values, first), None)
 
 
 def back_through_hidden(

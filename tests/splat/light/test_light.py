@@ -18,7 +18,7 @@ from spacesim.data.geometry import fibonacci_sphere, look_at
 from spacesim.data.images import linear_from_srgb, load_image, srgb_from_linear
 from spacesim.data.records import Camera, Dataset, Sun
 from spacesim.data.store import read_points, write_points
-from spacesim.learning.networks import tensor_cores
+from spacesim.learning.networks import fused, tensor_cores
 from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.export.bake import bake
 from spacesim.splat.light import bounce
@@ -340,11 +340,16 @@ def with_scattered(
     return brightened(light, color, reflected), given
 
 
-@pytest.fixture(params=["all at once", "hidden layers in between"])
+@pytest.fixture(params=["the backend's way", "all at once", "hidden layers in between"])
 def _products(request, monkeypatch) -> None:
-    """As networks of 128 units and more are computed on CUDA; on a CPU other products stand for those of its tensor
-    cores."""
+    """As networks are computed: by a kernel each on a CPU, in one recording, and as those of 128 units and more on
+    CUDA; on a CPU other products stand for those of its tensor cores."""
+    if request.param == "the backend's way":
+        assert select() == "cuda" or fused.takes(FIELD.shape)
+        return
+    monkeypatch.setattr(fused, "takes", lambda shape: False)
     if request.param == "all at once":
+        monkeypatch.setattr(tensor_cores, "takes", lambda shape, columns: False)
         return
     monkeypatch.setattr(tensor_cores, "WIDE", 1)
     if select() == "llvm":

@@ -6,7 +6,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, TensorXf
-from spacesim.learning.networks import mlp, network, tensor_cores, warps
+from spacesim.learning.networks import fused, mlp, network, tensor_cores, warps
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import field_color_slope, normals_adjoint, sun_adjoint
 from spacesim.splat.light.padded_batch import PaddedBatch
@@ -28,6 +28,10 @@ def adjoint(
     """(gradient of the features, gradients of the weights, [gradient of `SunEncoding.field_encoding`] where pictures
     have embeddings, [gradient of the Sun's direction, Float [3]] where `by_sun` asks for it)."""
     shape, of_field = config.field.shape, split_weights(config, weights)[0]
+    if any(fused.has_made(made) for made in (tape.field, tape.refine) if made):
+        gradients = _output_gradients(config, inputs, batch, tape, grad_color, grad_visibility)
+        by_networks = [fused.backward(way) for way in _ways(config, weights, inputs, tape, gradients, by_sun)]
+        return _gathered(config, weights, inputs, batch, gradients, by_networks, by_sun)
     if not tensor_cores.takes(shape, batch.capacity):
         return _adjoint(config, weights, inputs, batch, tape, grad_color, grad_visibility, by_sun)
     gradients, last = _until_hidden(config, weights, inputs, batch, tape, grad_color, grad_visibility, by_sun)
@@ -95,6 +99,7 @@ def _after_hidden(
     return _gathered(config, weights, inputs, batch, gradients, by_networks, by_sun)
 
 
+@recorded
 def _output_gradients(
     config: LightConfig,
     inputs: ShadingInputs,
@@ -146,6 +151,7 @@ def _ways(
     return ways
 
 
+@recorded
 def _gathered(
     config: LightConfig,
     weights: list[Float],

@@ -6,7 +6,7 @@ import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, TensorXf
-from spacesim.learning.networks import mlp, network, tensor_cores
+from spacesim.learning.networks import fused, mlp, network, tensor_cores
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.bounce import received_on_sides
@@ -18,6 +18,7 @@ from spacesim.splat.light.shading.scattering import (
     Shares,
     add_scattered,
     emitted_light,
+    painted_items,
     received_light,
     scattered_light,
     scatterers_of,
@@ -40,27 +41,59 @@ class ShadingTape:
     scattered: list[Float]  #: of `scattered_light`, [M] each, or nothing
 
 
+@dataclass
+class _NetworkInputs:
+    """What networks read that are computed by launches."""
+
+    field: tuple[TensorXf, network.InputLayer]  #: items, first layer
+    refinement: tuple[TensorXf, network.InputLayer] | None  #: the same, where there is one
+    painted: TensorXf | None  #: of `painted_items`, where emitters are
+
+
+@dataclass
+class _Launched:
+    """What launches have made of `_NetworkInputs`; None: the recording makes it."""
+
+    field: network.Launched | None = None
+    refinement: network.Launched | None = None
+    painted: TensorXf | None = None  #: what the field says of it
+
+
 def shade(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
 ) -> tuple[list[Float], list[Float], ShadingTape]:
     """(dimmed colours, [visibility] or [], tape)."""
-    shape, of_field = config.field.shape, split_weights(config, weights)[0]
-    if not tensor_cores.takes(shape, batch.capacity):
-        return _shade(config, weights, inputs, batch, None)
-    items, first = _first_of_field(config, of_field, inputs, batch)
-    if dr.grad_enabled(items, first.matrix, first.bias, of_field):  # which a launch would not know of
-        return _shade(config, weights, inputs, batch, None)
-    hidden = tensor_cores.hidden_layers(shape, of_field, items, first)
-    return _shade(config, weights, inputs, batch, hidden)
+    shape, refine, (of_field, of_refinement) = config.field.shape, config.refine, split_weights(config, weights)
+    is_fused = fused.takes(shape) and (refine is None or fused.takes(refine.shape))
+    launched = _Launched()
+    if is_fused or tensor_cores.takes(shape, batch.capacity):
+        read = _network_inputs(config, weights, inputs, batch, is_fused)
+        if dr.grad_enabled(read, weights):  # which a launch would not know of
+            return _shade(config, weights, inputs, batch, launched)
+        forward = fused.forward if is_fused else tensor_cores.forward
+        launched.field = forward(shape, of_field, *read.field)
+        if read.refinement and refine:
+            launched.refinement = forward(refine.shape, of_refinement, *read.refinement)
+        if read.painted is not None:
+            launched.painted = forward(shape, of_field, read.painted, read.field[1]).outputs
+    return _shade(config, weights, inputs, batch, launched)
 
 
 @recorded
-def _first_of_field(
-    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> tuple[TensorXf, network.InputLayer]:
-    """(items, first layer) of the field. weights: of the field"""
+def _network_inputs(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, of_all: bool
+) -> _NetworkInputs:
+    """of_all: for all networks, or for the field's pass over the batch alone"""
+    of_field, of_refinement = split_weights(config, weights)
     items = field_items(config.field, inputs.features, field_views(config.field, inputs.of_field(), batch), batch)
-    return items, mlp.make_input_layer(config.field.shape, weights, inputs.sun.field_encoding)
+    refine_items = _refine_items(config, inputs, batch) if of_all else None
+    is_painted = of_all and config.mirrors and inputs.surroundings is not None
+    painted = painted_items(config, inputs, batch.count) if is_painted else None
+    first, refinement = mlp.make_input_layer(config.field.shape, of_field, inputs.sun.field_encoding), None
+    if refine_items is not None and config.refine:
+        of_refine = mlp.make_input_layer(config.refine.shape, of_refinement, inputs.sun.refine_encoding)
+        refinement = refine_items, of_refine
+    return _NetworkInputs((items, first), refinement, painted)
 
 
 @recorded
@@ -69,24 +102,26 @@ def _shade(
     weights: list[Float],
     inputs: ShadingInputs,
     batch: PaddedBatch,
-    hidden: network.MlpTape | None,
+    launched: _Launched,
 ) -> tuple[list[Float], list[Float], ShadingTape]:
-    """`shade`. hidden: of the field's hidden layers, where they have been computed"""
+    """`shade`, with what launches have made."""
     field_weights, refine_weights = split_weights(config, weights)
     field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
-    of_refinement = _refine_items(config, inputs, batch)  # written in one kernel with the field's, if any are
-    items = hidden.values[0] if hidden else field_items(config.field, inputs.features, views, batch)
-    encoding = inputs.sun.field_encoding
-    output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, hidden=hidden)
+    # written in one kernel with the field's, if any are
+    refine_items = launched.refinement.tape.values[0] if launched.refinement else _refine_items(config, inputs, batch)
+    by_field, encoding = launched.field, inputs.sun.field_encoding
+    items = by_field.tape.values[0] if by_field else field_items(config.field, inputs.features, views, batch)
+    output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, launched=by_field)
     colors = [field_color(config.decoding, value) for value in output]
-    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch, of_refinement)
+    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch, refine_items, launched.refinement)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     visibility = [1 - value for value in occlusion]
     outputs = _dimmed(inputs.sun, colors, visibility, faces)
     dr.eval(outputs, colors, occlusion, visibility, faces)
     shares = _emitters_shares(config, refine_weights, inputs, batch, visibility)
-    emitted = emitted_light(config, field_weights, inputs, shares, batch, field_tape.input_layer)
+    first, painted = field_tape.input_layer, launched.painted
+    emitted = emitted_light(config, field_weights, inputs, shares, batch, first, painted)
     light = received_light(config, inputs, emitted, batch, diffuse=True, mirrors=config.mirrors)
     scattered = scattered_light(config, inputs, light[:3], light[3:], batch)
     if scattered:
@@ -190,13 +225,15 @@ def _refine_occlusion(
     inputs: ShadingInputs,
     batch: PaddedBatch,
     items: TensorXf | None,
+    launched: network.Launched | None = None,
 ) -> tuple[list[Float], network.MlpTape | None]:
-    """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`"""
+    """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`;  launched: of these"""
     occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
     if not config.refine:
         return occlusion, None
     assert items is not None, "the refinement has inputs"
-    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, inputs.sun.refine_encoding)
+    encoding = inputs.sun.refine_encoding
+    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, encoding, launched=launched)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
 

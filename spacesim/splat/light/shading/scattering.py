@@ -5,7 +5,7 @@ from collections.abc import Callable
 import drjit as dr
 
 from spacesim.backend import ad
-from spacesim.backend.arrays import Float, UInt32
+from spacesim.backend.arrays import Float, TensorXf, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light.bounce import (
@@ -55,14 +55,22 @@ def emitted_light(
     shares: Shares,
     batch: PaddedBatch,
     input_layer: network.InputLayer | None = None,
+    painted: TensorXf | None = None,
 ) -> list[Float]:
-    """What `emission` gives, or nothing. weights: of the field;  input_layer: of the field, if it is known"""
+    """What `emission` gives, or nothing. weights: of the field;  input_layer: of the field, if it is known;  painted:
+    what the field says of `painted_items`, if that is"""
     surroundings = inputs.surroundings
     if surroundings is None:
         return []
     scatterers, emitters = scatterers_of(config, inputs), surroundings.emitters
     if config.mirrors:
-        light = _painted(config, weights, inputs, shares, emitters, batch.count, input_layer)
+        shape = config.field.shape
+        if painted is None:
+            items = painted_items(config, inputs, batch.count)
+            output, _ = mlp.forward(shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
+        else:
+            output = [network.row_of(painted, i) for i in range(shape.outputs)]
+        light = _painted(config, output, shares)
     else:
         light = albedo_radiance(scatterers, shares(dr.arange(ad.UInt32, config.bounce)), emitters, batch.count)
     return emission(scatterers, surroundings, config.bounce, light, batch.count)
@@ -89,24 +97,13 @@ def received_light(
     return received_on_seen(scatterers, around, emitted, config.bounce, batch, directions, diffuse, mirrors)
 
 
-def _painted(
-    config: LightConfig,
-    weights: list[Float],
-    inputs: ShadingInputs,
-    shares: Shares,
-    emitters: UInt32,
-    gaussians: UInt32,
-    input_layer: network.InputLayer | None,
-) -> list[Float]:
-    """The light of the Gaussians that are `emitters`, three Floats, as the field paints them: mean of what is seen of
-    each from four sides at 45 degrees to its normal, all off the plane of Sun and normal, in which mirrors show the
-    Sun.
-
-    weights, input_layer: as in `emitted_light`
-    """
-    field, count = config.field, config.bounce
+def painted_items(config: LightConfig, inputs: ShadingInputs, gaussians: UInt32) -> TensorXf:
+    """Items of the field, TensorXf [B, C, m]: emitters seen from `SIDES` sides at 45 degrees to their normals, all off
+    the plane of Sun and normal, in which mirrors show the Sun. gaussians: N"""
+    assert inputs.surroundings is not None, "something is emitted"
+    field, count, emitters = config.field, config.bounce, inputs.surroundings.emitters
     columns = PaddedBatch.with_room_for(SIDES * count, gaussians)
-    column = dr.minimum(dr.arange(ad.UInt32, columns.capacity), SIDES * count - 1)
+    column = _painted_columns(count, columns.capacity)
     number, side = dr.gather(ad.UInt32, emitters, column // SIDES), column % SIDES
     normals = lit_normals(scatterers_of(config, inputs), number, gaussians)
     along = across(normals, towards_sun(inputs.sun.light_axes))
@@ -114,10 +111,19 @@ def _painted(
     direction = -(0.5**0.5) * (normals + cosine * along + sine * dr.cross(normals, along))
     rows = [dr.gather(ad.Float, inputs.features, i * gaussians + number) for i in range(field.features)]
     rows += [*field.view(direction), *surface_cosines(normals, direction, towards_sun(inputs.sun.light_axes))]
-    items = columns.matrix(rows, field.shape.rows)
-    output, _ = mlp.forward(field.shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
-    colors = [field_color(config.decoding, value) for value in output]
-    for share in shares(column // SIDES):
+    return columns.matrix(rows, field.shape.rows)
+
+
+def _painted_columns(count: int, capacity: int) -> UInt32:
+    """Sides of emitters, `SIDES` each, the last repeated."""
+    return dr.minimum(dr.arange(ad.UInt32, capacity), SIDES * count - 1)
+
+
+def _painted(config: LightConfig, output: list[Float], shares: Shares) -> list[Float]:
+    """The light of the emitters, three Floats, as the field paints them: mean of what is seen of their sides. output:
+    of the field of `painted_items`"""
+    colors, count = [field_color(config.decoding, value) for value in output], config.bounce
+    for share in shares(_painted_columns(count, dr.width(output)) // SIDES):
         colors = [color * share for color in colors]
     light = colors if config.linear else [decode_srgb(color) for color in colors]
     dr.eval(light)
