@@ -4,7 +4,7 @@ Dr.Jit's products take each layer through memory: two cores with AVX-512 take th
 are launched between recordings, as `splat/light/shading/` does.
 """
 
-from functools import cache
+from functools import cache, partial
 from math import prod
 
 import drjit as dr
@@ -13,7 +13,16 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Float, TensorXf
 from spacesim.backend.kernels.llvm import LlvmKernel, empty, is_usable, vector_width
 from spacesim.learning.networks.fused_text import PANEL, PER_CHUNK, FusedText, full
-from spacesim.learning.networks.network import CHUNK, InputLayer, Launched, MlpShape, MlpTape, WayBack, round_up_rows
+from spacesim.learning.networks.network import (
+    CHUNK,
+    InputLayer,
+    Launched,
+    MlpShape,
+    MlpTape,
+    PartialLayer,
+    WayBack,
+    round_up_rows,
+)
 
 WIDEST = 256  #: units of a layer, or numbers of an item: panels of these have room on a thread's stack
 PARTS = 64  #: sums over columns are made in so many parts, one for each task: the same bits for any number of threads
@@ -38,6 +47,18 @@ def forward(shape: MlpShape, weights: list[Float], items: TensorXf, first: Input
     arrays = [items.array, *_layers(shape, weights, first), *[values.array for values in hidden], output.array]
     _forward_kernel(shape)([chunks * PER_CHUNK], arrays, [])
     return Launched(MlpTape([items, *hidden], first), output)
+
+
+def outputs(
+    shape: MlpShape, weights: list[Float], items: TensorXf, first: InputLayer, known: PartialLayer | None = None
+) -> Launched:
+    """All layers, of the items [B, C, m], without hidden ones in the tape. first: the first layer;  known: what it
+    makes of first inputs, where items are the others alone"""
+    chunks, rows, _ = items.shape
+    output = _tensor((chunks, shape.outputs, CHUNK))
+    arrays = [items.array, *_layers(shape, weights, first), output.array, *([known.values.array] if known else [])]
+    _outputs_kernel(shape, rows, known is not None)([chunks * PER_CHUNK], arrays, [])
+    return Launched(MlpTape([items], first), output)
 
 
 def backward(way: WayBack) -> tuple[list[Float], TensorXf]:
@@ -82,6 +103,13 @@ def _forward_kernel(shape: MlpShape) -> LlvmKernel:
     text, layers = FusedText(shape, shape.rows, vector_width()), range(shape.layers)
     names = ["items", *[f"{kind}{i}" for kind in ("matrix", "bias") for i in layers]]
     return LlvmKernel([*names, *[f"hidden{i}" for i in layers[:-1]], "output"], [], ("forward", text.forward))
+
+
+@cache
+def _outputs_kernel(shape: MlpShape, rows: int, is_known: bool) -> LlvmKernel:
+    text, layers = FusedText(shape, shape.rows, vector_width()), range(shape.layers)
+    names = ["items", *[f"{kind}{i}" for kind in ("matrix", "bias") for i in layers], "output", *["known"][:is_known]]
+    return LlvmKernel(names, [], ("outputs", partial(text.outputs, rows, is_known)))
 
 
 @cache

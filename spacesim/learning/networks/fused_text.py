@@ -29,9 +29,10 @@ class FusedText:
 
     wanted: rows of the items of which gradients are wanted
 
-    Arrays: `items` [B, rows, m] and `output` [B, outputs, m] in chunks; `matrix0`, ... and `bias0`, ... of the layers,
-    the first as `network.InputLayer` has it; `hidden0`, ... by panels; of the way back `by_output`, `by_items` as what
-    they are gradients of, `parts` [tasks, `part`], `by_matrix0`, ..., `by_bias0`, ..., `by_shared`, and `shared`.
+    Arrays: `items` [B, rows, m], `output` [B, outputs, m] and `known` [B, width, m] in chunks; `matrix0`, ... and
+    `bias0`, ... of the layers, the first as `network.InputLayer` has it; `hidden0`, ... by panels; of the way back
+    `by_output`, `by_items` as what they are gradients of, `parts` [tasks, `part`], `by_matrix0`, ..., `by_bias0`, ...,
+    `by_shared`, and `shared`.
     """
 
     def __init__(self, shape: MlpShape, wanted: int, width: int) -> None:
@@ -47,26 +48,48 @@ class FusedText:
 
     def forward(self, text: Text) -> None:
         """A panel: what all layers say of it."""
-        panel, shape = text.index, self.shape
-        text.room("panel", shape.rows * PANEL)
-        chunk, within = panel // text.integer(PER_CHUNK), panel % text.integer(PER_CHUNK) * PANEL
-        self._take(text, "panel", "items", shape.rows, chunk, within)
-        source, first = "panel", text.integer(0)
-        for i, (rows, columns) in enumerate(shape.sizes):
-            if i < shape.layers - 1:
-                target, start, stride = f"hidden{i}", panel * (full(rows) * PANEL), PANEL
-            else:
-                target, start, stride = "output", chunk * (rows * CHUNK) + within, CHUNK
-            self._layer(text, i, shape.rows if i == 0 else columns, (source, first), (target, start, stride))
-            source, first = target, start
+        hidden = text.index * (full(self.shape.width) * PANEL)
+        self._forward(text, self.shape.rows, [(f"hidden{i}", hidden) for i in range(self.shape.layers - 1)])
 
-    def _layer(self, text: Text, i: int, columns: int, source: tuple[str, Value], to: tuple[str, Value, int]) -> None:
+    def outputs(self, rows: int, is_known: bool, text: Text) -> None:
+        """A panel of items of so many rows: what the last layer says of it. is_known: a part of the first layer is, in
+        the array `known`"""
+        for name in ("hidden0", "hidden1"):
+            text.room(name, self.shape.width * PANEL)
+        hidden = [(f"hidden{i % 2}", text.integer(0)) for i in range(self.shape.layers - 1)]
+        self._forward(text, rows, hidden, "known" if is_known else None)
+
+    def _forward(self, text: Text, rows: int, hidden: list[tuple[str, Value]], known: str | None = None) -> None:
+        """rows: of the items;  hidden: arrays and places of what hidden layers say"""
+        chunk, within = text.index // text.integer(PER_CHUNK), text.index % text.integer(PER_CHUNK) * PANEL
+        text.room("panel", rows * PANEL)
+        self._take(text, "panel", "items", rows, chunk, within)
+        source, columns = ("panel", text.integer(0)), rows
+        for i in range(self.shape.layers - 1):
+            start = None if known is None or i > 0 else chunk * (self.shape.width * CHUNK) + within
+            self._layer(text, i, columns, source, (*hidden[i], PANEL), start)
+            source, columns = hidden[i], self.shape.width
+        last, start = self.shape.layers - 1, chunk * (self.shape.outputs * CHUNK) + within
+        self._layer(text, last, columns, source, ("output", start, CHUNK), start if known and last == 0 else None)
+
+    def _layer(
+        self,
+        text: Text,
+        i: int,
+        columns: int,
+        source: tuple[str, Value],
+        to: tuple[str, Value, int],
+        known: Value | None,
+    ) -> None:
         """What layer i says of a panel. source: array and place of what it reads;  to: those of what it says, and the
-        stride of its rows"""
+        stride of its rows;  known: place of what it says of other inputs, if it does"""
         target, start, stride = to
 
-        def begin(row: Value, _: int) -> Value:
-            return text.spread(text.load_floats(f"bias{i}", row), LANES)
+        def begin(row: Value, vector: int) -> Value:
+            bias = text.spread(text.load_floats(f"bias{i}", row), LANES)
+            if known is None:
+                return bias
+            return bias + text.load_floats("known", known + row * CHUNK + vector * LANES, LANES)
 
         def end(row: Value, vector: int, value: Value) -> None:
             said = value if target == "output" else _positive(text, value, value)

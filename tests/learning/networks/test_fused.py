@@ -57,6 +57,22 @@ def test_networks_and_their_way_back_match_float64(name, count):
         np.testing.assert_allclose(numbers(one), other, rtol=1e-4, atol=1e-6 * (100 + count))
 
 
+@pytest.mark.parametrize("name", ALL)
+def test_outputs_alone_are_the_same(name):
+    case = Case(ALL[name], CHUNK + 1)
+    weights, rows, shared, _, batch = case.device()
+    shape, rows = case.shape, [batch.pad_zeros(row) for row in rows]
+    items, first = batch.matrix(rows, shape.rows), mlp.make_input_layer(shape, weights, shared)
+    found = fused.outputs(shape, weights, items, first).outputs
+    usual = fused.forward(shape, weights, items, first).outputs
+    np.testing.assert_array_equal(numbers(found), numbers(usual))
+    for count in (1, shape.inputs - 1):  # of inputs whose part in the first layer is known
+        known = mlp.first_layer_part(shape, weights, batch.matrix(rows[:count], round_up_rows(count)), count)
+        others = batch.matrix(rows[count:], round_up_rows(shape.inputs - count))
+        found = fused.outputs(shape, weights, others, mlp.make_input_layer(shape, weights, shared, count), known)
+        np.testing.assert_allclose(columns(found.outputs, case.count), case.exact()[0], atol=2e-6)
+
+
 def test_gradients_of_the_first_items_are_those_of_all():
     case = Case(ALL["odd"], 700)
     _, _, grad_items = passes(case)

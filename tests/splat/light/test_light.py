@@ -561,10 +561,13 @@ def test_a_sun_that_stays_is_asked_for_once():
     assert light.sunlight(splats, -SUN) is not light.sunlight(splats, -SUN), "gradients would be lost"
 
 
-@pytest.mark.parametrize("by_vectors", [False, True])
+@pytest.mark.parametrize("way", ["the backend's", "in one recording", "by vectors"])
 @pytest.mark.parametrize("name", CONFIGS)
-def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, by_vectors):
+def test_pictures_have_the_colors_that_are_trained(monkeypatch, name, way):
+    by_vectors = way == "by vectors"
     monkeypatch.setattr(light_module, "COOPERATIVE", ("cuda", "llvm") if by_vectors else ())
+    if way == "in one recording":
+        monkeypatch.setattr(fused, "takes", lambda shape: False)
     made, cache = [], light_module._PictureCache
     monkeypatch.setattr(light_module, "_PictureCache", lambda *parts: made.append(parts) or cache(*parts))
     light, tolerance = model(name), 2e-3 if by_vectors else 1e-5

@@ -41,12 +41,16 @@ class ShadingTape:
     scattered: list[Float]  #: of `scattered_light`, [M] each, or nothing
 
 
+_Read = tuple[TensorXf, network.InputLayer]
+"""Items of a network, its first layer."""
+
+
 @dataclass
 class _NetworkInputs:
     """What networks read that are computed by launches."""
 
-    field: tuple[TensorXf, network.InputLayer]  #: items, first layer
-    refinement: tuple[TensorXf, network.InputLayer] | None  #: the same, where there is one
+    field: _Read
+    refinement: _Read | None  #: where there is one
     painted: TensorXf | None  #: of `painted_items`, where emitters are
 
 
@@ -75,7 +79,7 @@ def shade(
         if read.refinement and refine:
             launched.refinement = forward(refine.shape, of_refinement, *read.refinement)
         if read.painted is not None:
-            launched.painted = forward(shape, of_field, read.painted, read.field[1]).outputs
+            launched.painted = fused.outputs(shape, of_field, read.painted, read.field[1]).outputs
     return _shade(config, weights, inputs, batch, launched)
 
 
@@ -87,13 +91,21 @@ def _network_inputs(
     of_field, of_refinement = split_weights(config, weights)
     items = field_items(config.field, inputs.features, field_views(config.field, inputs.of_field(), batch), batch)
     refine_items = _refine_items(config, inputs, batch) if of_all else None
-    is_painted = of_all and config.mirrors and inputs.surroundings is not None
-    painted = painted_items(config, inputs, batch.count) if is_painted else None
-    first, refinement = mlp.make_input_layer(config.field.shape, of_field, inputs.sun.field_encoding), None
-    if refine_items is not None and config.refine:
-        of_refine = mlp.make_input_layer(config.refine.shape, of_refinement, inputs.sun.refine_encoding)
-        refinement = refine_items, of_refine
-    return _NetworkInputs((items, first), refinement, painted)
+    painted = painted_items(config, inputs, batch.count) if of_all and _is_painted(config, inputs) else None
+    first = mlp.make_input_layer(config.field.shape, of_field, inputs.sun.field_encoding)
+    of_refine = None if refine_items is None else (refine_items, _refine_layer(config, of_refinement, inputs))
+    return _NetworkInputs((items, first), of_refine, painted)
+
+
+def _is_painted(config: LightConfig, inputs: ShadingInputs) -> bool:
+    """Whether emitters are as the field paints them."""
+    return config.mirrors and inputs.surroundings is not None
+
+
+def _refine_layer(config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs) -> network.InputLayer:
+    """First layer of the refinement."""
+    assert config.refine is not None, "there is one"
+    return mlp.make_input_layer(config.refine.shape, refine_weights, inputs.sun.refine_encoding)
 
 
 @recorded
@@ -131,7 +143,6 @@ def _shade(
     return outputs[:3], outputs[3:], ShadingTape(field_tape, refine_tape, colors, occlusion, faces, scattered)
 
 
-@recorded
 def shade_picture(
     config: LightConfig,
     field_weights: list[Float],
@@ -142,9 +153,49 @@ def shade_picture(
     sunlight: Sunlight,
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
+    launched = None
+    if first_layer and fused.takes(config.field.shape):
+        read = _picture_inputs(config, field_weights, inputs, batch, first_layer.inputs)
+        launched = _outputs(config.field.shape, field_weights, read, first_layer)
+    return _shade_picture(config, field_weights, inputs, batch, first_layer, packed, launched, sunlight)
+
+
+def _outputs(
+    shape: network.MlpShape, weights: list[Float], read: _Read, known: network.PartialLayer | None = None
+) -> TensorXf | None:
+    """By a launch; None where gradients are asked for, which it would not know of."""
+    if dr.grad_enabled(read, weights, [known.values] if known else []):
+        return None
+    return fused.outputs(shape, weights, *read, known).outputs
+
+
+@recorded
+def _picture_inputs(
+    config: LightConfig, field_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, known: int
+) -> _Read:
+    """Of the field's inputs but for so many first ones."""
+    views = field_views(config.field, inputs.of_field(), batch)
+    layer = mlp.make_input_layer(config.field.shape, field_weights, inputs.sun.field_encoding, known)
+    return batch.matrix(views, round_up_rows(len(views))), layer
+
+
+@recorded
+def _shade_picture(
+    config: LightConfig,
+    field_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    first_layer: network.PartialLayer | None,
+    packed: cooperative.PackedNetwork | None,
+    launched: TensorXf | None,
+    sunlight: Sunlight,
+) -> list[Float]:
+    """launched: what the field says, if that is known"""
     field, field_inputs = config.field, inputs.of_field()
     views = field_views(field, field_inputs, batch)
-    if packed is None:
+    if launched is not None:
+        outputs = [network.row_of(launched, i) for i in range(field.shape.outputs)]
+    elif packed is None:
         assert first_layer is not None, "one of the two"
         items = batch.matrix(views, round_up_rows(len(views)))
         outputs, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
@@ -167,23 +218,76 @@ def shade_picture(
     return batch.unpad(shown, inputs.means.x)
 
 
-@recorded
 def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
     """Of the Sun, refined, [N]."""
     _, refine_weights = split_weights(config, weights)
-    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, batch, _refine_items(config, inputs, batch))
-    visibility = 1 - occlusion[0]
+    launched = None
+    if config.refine and fused.takes(config.refine.shape):
+        read = _refine_inputs(config, refine_weights, inputs, batch)
+        launched = _outputs(config.refine.shape, refine_weights, read)
+    return _refined_visibility(config, refine_weights, inputs, batch, launched)
+
+
+@recorded
+def _refine_inputs(
+    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+) -> _Read:
+    items = _refine_items(config, inputs, batch)
+    assert items is not None, "there is a refinement"
+    return items, _refine_layer(config, refine_weights, inputs)
+
+
+@recorded
+def _refined_visibility(
+    config: LightConfig,
+    refine_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    launched: TensorXf | None,
+) -> Float:
+    """launched: what the refinement says, if that is known"""
+    if launched is None or config.refine is None:
+        items = _refine_items(config, inputs, batch)
+        (occlusion,), _ = _refine_occlusion(config, refine_weights, inputs, batch, items)
+    else:
+        (raw,) = _raw_occlusion(inputs, batch)
+        occlusion = refine_occlusion(config.refine, raw, network.row_of(launched, 0))
+    visibility = 1 - occlusion
     dr.eval(visibility)
     return batch.unpad([visibility], inputs.means.x)[0]
 
 
-@recorded
 def scatter_sunlight(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visibility: list[Float]
 ) -> tuple[list[Float], list[Float]]:
     """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
     field_weights, _ = split_weights(config, weights)
-    emitted = emitted_light(config, field_weights, inputs, shares_of(inputs, visibility), batch)
+    painted = None
+    if _is_painted(config, inputs) and fused.takes(config.field.shape):
+        painted = _outputs(config.field.shape, field_weights, _painted_inputs(config, field_weights, inputs, batch))
+    return _scatter_sunlight(config, field_weights, inputs, batch, visibility, painted)
+
+
+@recorded
+def _painted_inputs(
+    config: LightConfig, field_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
+) -> _Read:
+    first = mlp.make_input_layer(config.field.shape, field_weights, inputs.sun.field_encoding)
+    return painted_items(config, inputs, batch.count), first
+
+
+@recorded
+def _scatter_sunlight(
+    config: LightConfig,
+    field_weights: list[Float],
+    inputs: ShadingInputs,
+    batch: PaddedBatch,
+    visibility: list[Float],
+    painted: TensorXf | None,
+) -> tuple[list[Float], list[Float]]:
+    """painted: what the field says of `painted_items`, if that is known"""
+    shares = shares_of(inputs, visibility)
+    emitted = emitted_light(config, field_weights, inputs, shares, batch, painted=painted)
     bounced: list[Float] = []
     if emitted and inputs.surroundings:
         scatterers = scatterers_of(config, inputs)
@@ -228,13 +332,18 @@ def _refine_occlusion(
     launched: network.Launched | None = None,
 ) -> tuple[list[Float], network.MlpTape | None]:
     """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`;  launched: of these"""
-    occlusion = [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
+    occlusion = _raw_occlusion(inputs, batch)
     if not config.refine:
         return occlusion, None
     assert items is not None, "the refinement has inputs"
     encoding = inputs.sun.refine_encoding
     (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, encoding, launched=launched)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
+
+
+def _raw_occlusion(inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
+    """[M] in a list, or nothing."""
+    return [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
 
 
 def _emitters_shares(

@@ -38,6 +38,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import make_boxes, make_lists
 from spacesim.splat.raster.lists.boxes import Boxes, Grid
 from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent, PairCounts
+from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats
 
 MAX_LIGHT_SIZE = 8192  #: pixels of a side of the light's picture
@@ -244,15 +245,20 @@ def _seen_by_sun(sunlit: _Sunlit, live: UInt32, most: int, grid: Grid) -> _SunPi
     return _SunPicture(view, splats, footprints, make_boxes(splats, footprints, live, most, grid))
 
 
-@recorded
 def _cast(sunlit: _Sunlit, seen: _SunPicture, limit: UInt32, capacities: Capacities, grid: Grid) -> Float:
     """Occlusion [N] by lists of these capacities: 0 where there are more pairs than `limit`."""
-    view, rows, method = seen.view, sunlit.rows, sunlit.method
     lists = make_lists(seen.footprints, seen.boxes, limit, capacities, grid)
+    return _occlusion(sunlit, seen.view, seen.splats, lists, capacities.splats)
+
+
+@recorded
+def _occlusion(sunlit: _Sunlit, view: _LightView, splats: Splats, lists: TileLists, capacity: int) -> Float:
+    """Occlusion [N] by the lists of the Sun's picture. capacity: length of the splats' arrays"""
+    rows, method = sunlit.rows, sunlit.method
     if isinstance(method, MappingConfig):
         receivers = MapReceivers(rows, view.points, view.bias.bias, sunlit.softness)
-        return occlusion_in_map(receivers, [], seen.splats, lists, view.camera, method, capacities.splats)
-    return occlusion_in_events(seen.splats, lists, (sunlit.size, sunlit.size), sunlit.batch, rows[0])
+        return occlusion_in_map(receivers, [], splats, lists, view.camera, method, capacity)
+    return occlusion_in_events(splats, lists, (sunlit.size, sunlit.size), sunlit.batch, rows[0])
 
 
 @recorded
