@@ -65,8 +65,8 @@ def test_numbers_are_rounded_as_float32():
             x * y,
             x / y,
             text.fma(x, y, text.one_float(-0.1)),
-            text.largest(x, y),
-            text.largest(y, x),
+            text.maximum(x, y),
+            text.maximum(y, x),
         ]
         for i, result in enumerate([*results, text.one_float(1 / 3)]):
             text.store("results", text.integer(i), result)

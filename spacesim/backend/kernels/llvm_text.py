@@ -199,7 +199,7 @@ class Text:
     def _shuffled(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
         """A vector of entries of two, numbered one after the other."""
         places = f"<{len(lanes)} x i32> <{', '.join(f'i32 {lane}' for lane in lanes)}>"
-        return self.value(x.kind, f"shufflevector {x.kind} {x.name}, {y.kind} {y.name}, {places}")
+        return self.value(vector(len(lanes)), f"shufflevector {x.kind} {x.name}, {y.kind} {y.name}, {places}")
 
     def prefetch(self, array: str, index: Value) -> None:
         """Ask the memory for an entry that will be loaded."""
@@ -220,10 +220,39 @@ class Text:
         call = f"@llvm.vector.reduce.fadd.v{_size(value.kind)}f32(float {_constant(-0.0)}, {value.kind} {value.name})"
         return self.value(FLOAT, f"call float {call}")
 
-    def largest(self, x: Value, y: Value) -> Value:
-        """The larger of two float32; the second where one is no number."""
-        is_larger = self.value("i1", f"fcmp ogt float {x.name}, {y.name}")
-        return self.value(FLOAT, f"select i1 {is_larger.name}, float {x.name}, float {y.name}")
+    def maximum(self, x: Value, y: Value | float) -> Value:
+        """The larger of two float32, or of each pair of two vectors; the second where one is no number."""
+        other = x.like(y)
+        return (other < x).choose(x, other)
+
+    def rcp(self, x: Value) -> Value:
+        """1 / x."""
+        return x.like(1) / x
+
+    def sqrt(self, x: Value) -> Value:
+        """Square root of a vector."""
+        return self.value(x.kind, f"call {x.kind} @llvm.sqrt.v{_size(x.kind)}f32({x.kind} {x.name})")
+
+    def load_threes(self, array: str, places: Sequence[Value]) -> list[Value]:
+        """The first three of the four numbers from each of sixteen places on, as three vectors."""
+        fours = [self.load_floats(array, place, 4) for place in places]
+        rows = []
+        for i in range(4):  # the numbers of places i, i + 4, i + 8 and i + 12
+            halves = [self._shuffled(fours[i + k], fours[i + k + 4], range(8)) for k in (0, 8)]
+            rows.append(self._shuffled(halves[0], halves[1], range(16)))
+
+        def beside(first: Value, second: Value, four: Sequence[int]) -> Value:
+            """Of each four numbers of both these; from 4 on: of the second."""
+            lanes = [base + lane % 4 + 16 * (lane // 4) for base in range(0, 16, 4) for lane in four]
+            return self._shuffled(first, second, lanes)
+
+        xy = [beside(*pair, (0, 4, 1, 5)) for pair in ((rows[0], rows[1]), (rows[2], rows[3]))]
+        zw = [beside(*pair, (2, 6, 3, 7)) for pair in ((rows[0], rows[1]), (rows[2], rows[3]))]
+        return [
+            beside(xy[0], xy[1], (0, 1, 4, 5)),
+            beside(xy[0], xy[1], (2, 3, 6, 7)),
+            beside(zw[0], zw[1], (0, 1, 4, 5)),
+        ]
 
     @contextmanager
     def loop(self, start: Value, end: Value, state: Sequence[Value] = (), step: Value | int = 1) -> Iterator["Loop"]:
@@ -294,6 +323,7 @@ declare i64 @llvm.umin.i64(i64, i64)
 declare void @llvm.prefetch.p0(ptr, i32, i32, i32)
 declare float @llvm.fma.f32(float, float, float)
 declare <16 x float> @llvm.fma.v16f32(<16 x float>, <16 x float>, <16 x float>)
+declare <16 x float> @llvm.sqrt.v16f32(<16 x float>)
 declare float @llvm.vector.reduce.fadd.v16f32(float, <16 x float>)
 declare <16 x i1> @llvm.get.active.lane.mask.v16i1.i64(i64, i64)
 declare <16 x float> @llvm.masked.load.v16f32.p0(ptr, i32, <16 x i1>, <16 x float>)

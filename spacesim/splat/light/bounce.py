@@ -6,6 +6,7 @@ sees. A field that takes the cosines of one Gaussian cannot know which of its ne
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import drjit as dr
 
@@ -38,25 +39,55 @@ class Scatterers:
     sun: Array3f  #: Array3f of width 1, unit, towards the Sun
 
 
-Weights = Callable[[Array3f], list[Float]]
-"""How much light that comes along a ray of this unit direction counts: Array3f [3, M] to Floats [M]."""
+@dataclass(frozen=True)
+class Parts:
+    """What is gathered of the light that comes along rays, RGB each."""
+
+    front: bool = False  #: w cos / pi of each ray on the side of the normal, which is 1 where the light all around is 1
+    back: bool = False  #: the same of the other side
+    mirrored: bool = False  #: two of `ray_weights`
+
+    @property
+    def count(self) -> int:
+        """Weights of a ray."""
+        return self.front + self.back + 2 * self.mirrored
+
+
+@dataclass
+class Rays:
+    """Of M Gaussians: where theirs stand in `Surroundings.met`, and what weighs them."""
+
+    begin: UInt32  #: [M], the first
+    end: UInt32  #: [M], one past the last
+    normals: Array3f  #: [3, M], unit
+    direction: Array3f | None  #: [3, M], unit, from the camera; None: none is mirrored
+
+
+SIDES = Parts(front=True, back=True)
+
+
+def rays_on_sides(scatterers: Scatterers, surroundings: Surroundings, batch: PaddedBatch) -> Rays:
+    """All rays of the batch's Gaussians."""
+    begin, *_, end = _bounds(surroundings, batch)
+    return Rays(begin, end, _normals(scatterers, batch), None)
+
+
+def rays_on_seen(scatterers: Scatterers, surroundings: Surroundings, batch: PaddedBatch, direction: Array3f) -> Rays:
+    """Those on the side that is seen, to which normals are turned. direction: [3, M], unit, from the camera"""
+    normals = _normals(scatterers, batch)
+    away, normals = points_away(normals, direction), seen_side_normals(normals, direction)
+    begin, behind, past, end = _bounds(surroundings, batch)
+    return Rays(dr.select(away, behind, begin), dr.select(away, end, past), normals, direction)
 
 
 def received_on_sides(
     scatterers: Scatterers, surroundings: Surroundings, emitted: list[Float], emitters: int, batch: PaddedBatch
 ) -> list[Float]:
     """Light that each Gaussian receives at the side to which its normal points, then at the other: RGB, Floats [M]
-    each, w cos / pi of each ray, which is 1 where the light of all around is 1. emitted: of `emission`, by so many
-    `emitters`"""
-    rays = _sorted_batch(surroundings, batch)
-    normals, share = _normals(scatterers, rays), ad.Float(4 / ray_count(emitters))
-
-    def weights(towards: Array3f) -> list[Float]:
-        here = dr.dot(normals, towards)
-        return [share * dr.maximum(here, 0), share * dr.maximum(-here, 0)]
-
-    begin, *_, end = _bounds(surroundings, rays)
-    return _in_columns(_gathered(surroundings, emitted, emitters, (begin, end), weights, 2), rays, batch)
+    each. emitted: of `emission`, by so many `emitters`"""
+    sorted_ = _sorted_batch(surroundings, batch)
+    rays = rays_on_sides(scatterers, surroundings, sorted_)
+    return _in_columns(_gathered(surroundings, emitted, emitters, rays, SIDES), sorted_, batch)
 
 
 def received_on_seen(
@@ -66,25 +97,13 @@ def received_on_seen(
     emitters: int,
     batch: PaddedBatch,
     directions: Callable[[PaddedBatch], Array3f],
-    diffuse: bool,
-    mirrors: bool,
+    parts: Parts,
 ) -> list[Float]:
-    """With `diffuse` what `received_on_sides` says of the side that is seen, three Floats [M]; with `mirrors` six of
-    `_mirroring`. directions: Array3f [3, M], unit, from the camera to a batch's Gaussians"""
-    rays = _sorted_batch(surroundings, batch)
-    direction, normals = directions(rays), _normals(scatterers, rays)
-    away, normals = points_away(normals, direction), seen_side_normals(normals, direction)
-    share = ad.Float(4 / ray_count(emitters))
-    mirrored = _mirroring(normals, direction, share)
-
-    def weights(towards: Array3f) -> list[Float]:
-        scattered = [share * dr.maximum(dr.dot(normals, towards), 0)] if diffuse else []
-        return scattered + (mirrored(towards) if mirrors else [])
-
-    begin, behind, past, end = _bounds(surroundings, rays)
-    bounds = dr.select(away, behind, begin), dr.select(away, end, past)
-    count = diffuse + 2 * mirrors
-    return _in_columns(_gathered(surroundings, emitted, emitters, bounds, weights, count), rays, batch)
+    """These parts of the light that arrives at the side that is seen, Floats [M]. directions: Array3f [3, M], unit,
+    from the camera to a batch's Gaussians"""
+    sorted_ = _sorted_batch(surroundings, batch)
+    rays = rays_on_seen(scatterers, surroundings, sorted_, directions(sorted_))
+    return _in_columns(_gathered(surroundings, emitted, emitters, rays, parts), sorted_, batch)
 
 
 def _sorted_batch(surroundings: Surroundings, batch: PaddedBatch) -> PaddedBatch:
@@ -110,17 +129,11 @@ def _bounds(surroundings: Surroundings, batch: PaddedBatch) -> list[UInt32]:
     return [dr.gather(ad.UInt32, surroundings.bounds, i * batch.count + batch.numbers()) for i in range(4)]
 
 
-def _gathered(
-    surroundings: Surroundings,
-    emitted: list[Float],
-    emitters: int,
-    bounds: tuple[UInt32, UInt32],
-    weights: Weights,
-    count: int,
-) -> list[Float]:
-    """Light along the rays from one of `Surroundings.met` to before another, three Floats [M], RGB, for each of so many
-    weights."""
-    (first, end), rays, turn = bounds, ray_count(emitters), TURN[select()]
+def _gathered(surroundings: Surroundings, emitted: list[Float], emitters: int, own: Rays, parts: Parts) -> list[Float]:
+    """Light along rays, three Floats [M], RGB, for each weight."""
+    rays, turn, share = ray_count(emitters), TURN[select()], ad.Float(ray_share(emitters))
+    normals, direction = own.normals, own.normals if own.direction is None else own.direction
+    view = -dr.dot(normals, direction)
 
     def has_more(k: UInt32, end: UInt32, _sums: list[Float]) -> Bool:
         return k < end
@@ -131,36 +144,58 @@ def _gathered(
         light = [load(emitted, met[u] & 0xFFFF, 2 * emitters, listed[u])[:3] for u in range(turn)]
         towards = [ad.Array3f(load(surroundings.directions, ray >> 16, rays)[:3]) for ray in met]
         for u in range(turn):
-            terms = [(weight, light[u][c]) for weight in weights(towards[u]) for c in range(3)]
+            here, along = dr.dot(normals, towards[u]), dr.dot(towards[u], direction)
+            weights = ray_weights(parts, here, along, view, share, dr)
+            terms = [(weight, light[u][c]) for weight in weights for c in range(3)]
             sums = [dr.fma(*term, total) for term, total in zip(terms, sums, strict=True)]
         return k + turn, end, sums
 
-    sums = [ad.Float(0) for _ in range(3 * count)]
-    return list(dr.while_loop((first, end, sums), has_more, add, mode="symbolic", label="bounce")[2])
+    sums = [ad.Float(0) for _ in range(3 * parts.count)]
+    return list(dr.while_loop((own.begin, own.end, sums), has_more, add, mode="symbolic", label="bounce")[2])
 
 
-def _mirroring(normals: Array3f, direction: Array3f, share: Float) -> Weights:
-    """Light that a Gaussian mirrors towards the viewer, on the scale of `received_on_sides`: per specular reflectance
-    at normal incidence, then per what it is at grazing incidence. normals, direction: Array3f [3, M], unit, of the side
-    that is seen and from the camera;  share: the angle w that a ray stands for, over pi
+def ray_share(emitters: int) -> float:
+    """The angle w that a ray stands for, over pi."""
+    return 4 / ray_count(emitters)
 
-    D n.l w / (4 (l.h)^2), the first times 1 - f, the other times f = (1 - l.h)^5: facets of GGX (Walter et al. 2007)
-    with the visibility of Kelemen and Szirmay-Kalos (2001) and Schlick's reflectance (1994); h halfway between the ray
-    and the viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the ray's own spread.
+
+class Functions(Protocol):
+    """Of numbers: Dr.Jit's, or those of a kernel's text."""
+
+    def maximum(self, x: Any, y: Any) -> Any:
+        """The larger of two."""
+
+    def rcp(self, x: Any) -> Any:
+        """1 / x."""
+
+    def sqrt(self, x: Any) -> Any:
+        """Square root."""
+
+
+def ray_weights(parts: Parts, here: Any, along: Any, view: Any, share: Any, functions: Functions) -> list[Any]:
+    """How much light along a ray l counts, for each of the parts. here: n.l;  along: l.d, d from the camera;
+    view: n.v = -n.d;  share: of `ray_share`
+
+    What is mirrored towards the viewer is on the scale of the others: per specular reflectance at normal incidence,
+    then per what it is at grazing incidence, D n.l w / (4 (l.h)^2), the first times 1 - f, the other times
+    f = (1 - l.h)^5: facets of GGX (Walter et al. 2007) with the visibility of Kelemen and Szirmay-Kalos (2001) and
+    Schlick's reflectance (1994); h halfway between ray and viewer, alpha^2 = `ROUGHNESS`^2 + w / (4 pi): half of the
+    ray's own spread.
     """
-    view = -dr.dot(normals, direction)
-
-    def mirrored(towards: Array3f) -> list[Float]:
-        here = dr.dot(normals, towards)
-        both = dr.maximum(1 - dr.dot(towards, direction), 1e-6)  # 1 + l.v = 2 (l.h)^2
-        alpha2 = 0.25 * share + ROUGHNESS**2
-        spread = dr.maximum(1 - 0.5 * dr.square(here + view) * dr.rcp(both) * (1 - alpha2), 1e-4)
-        weight: Float = 0.5 * share * alpha2 * dr.maximum(here, 0) * dr.rcp(dr.square(spread) * both)
-        beyond = 1 - dr.sqrt(0.5 * both)
-        grazing: Float = weight * dr.square(dr.square(beyond)) * beyond
-        return [weight - grazing, grazing]
-
-    return mirrored
+    maximum, rcp = functions.maximum, functions.rcp
+    weights = [share * maximum(here, 0)] if parts.front else []
+    if parts.back:
+        weights.append(share * maximum(-here, 0))
+    if parts.mirrored:
+        both = maximum(1 - along, 1e-6)  # 1 + l.v = 2 (l.h)^2
+        alpha2, sum_ = 0.25 * share + ROUGHNESS**2, here + view
+        spread = maximum(both - 0.5 * (1 - alpha2) * (sum_ * sum_), 1e-4 * both)
+        weight = 0.5 * share * alpha2 * maximum(here, 0) * both * rcp(spread * spread)
+        beyond = 1 - functions.sqrt(0.5 * both)
+        square = beyond * beyond
+        grazing = weight * (square * square) * beyond
+        weights += [weight - grazing, grazing]
+    return weights
 
 
 def grazing_reflectance(specular: Float) -> Float:

@@ -25,7 +25,7 @@ from spacesim.learning.reflectance import eclipse_numbers
 from spacesim.splat.light import cooperative
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.padded_batch import PaddedBatch
-from spacesim.splat.light.shading import backward, forward
+from spacesim.splat.light.shading import backward, forward, pictures
 from spacesim.splat.light.shading.forward import ShadingTape, split_weights
 from spacesim.splat.light.shading.inputs import ShadingInputs
 from spacesim.splat.light.shadow.cast import Shadows, cast_shadows
@@ -245,7 +245,7 @@ class LightModel:
             return None
         inputs = self._inputs(gaussians, None, self.encode_sun(sun), shadows, None)
         batch = PaddedBatch.of(gaussians.count, still=True)
-        return forward.refined_visibility(self.config, self.weights, inputs, batch)
+        return pictures.refined_visibility(self.config, self.weights, inputs, batch)
 
     def arriving(
         self,
@@ -263,7 +263,7 @@ class LightModel:
         inputs = self._inputs(gaussians, None, terms, None, self.surroundings(gaussians))
         batch = PaddedBatch.of(gaussians.count, still=True)
         shares = [] if visibility is None else [visibility]
-        return Sunlight(visibility, *forward.scatter_sunlight(self.config, self.weights, inputs, batch, shares))
+        return Sunlight(visibility, *pictures.scatter_sunlight(self.config, self.weights, inputs, batch, shares))
 
     def shade_picture(
         self,
@@ -302,7 +302,7 @@ class LightModel:
         around = self.surroundings(gaussians) if light.emitted else None  # what is not read is not traced
         inputs = self._inputs(gaussians, of_any_size, terms, None, around)
         of_field, _ = split_weights(self.config, self.weights)
-        shown = forward.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
+        shown = pictures.shade_picture(self.config, of_field, inputs, batch, cache.first_layer, cache.packed, light)
         return shown[:3], None if light.visibility is None else shown[3]
 
     def adjoint(
@@ -412,7 +412,7 @@ class LightModel:
         if cache is None:
             field = self.config.field
             packed = cooperative.pack(field.shape, of_field) if is_cooperative else None
-            first_layer = None if is_cooperative else forward.first_layer_of_features(field, of_field, features, batch)
+            first_layer = None if is_cooperative else pictures.first_layer_of_features(field, of_field, features, batch)
             cache = _PictureCache(first_layer, packed, self._mean_embedding())
             self._of_pictures.keep(cache, read)
         return cache

@@ -74,7 +74,7 @@ def _write(sizes: list[int], channels: int, absolute: bool, text: Text) -> None:
             "a": sxx * -0.5,
             "b": -sxy,
             "c": syy * -0.5,
-            "opacity": s0 * (text.one_float(1) / text.largest(opacity, text.one_float(1e-30))),
+            "opacity": s0 * (text.one_float(1) / text.maximum(opacity, text.one_float(1e-30))),
         }
         if absolute:
             for name in ("absolute_x", "absolute_y"):

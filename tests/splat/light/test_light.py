@@ -21,7 +21,7 @@ from spacesim.data.store import read_points, write_points
 from spacesim.learning.networks import fused, tensor_cores
 from spacesim.learning.networks.network import MlpShape
 from spacesim.splat.export.bake import bake
-from spacesim.splat.light import bounce
+from spacesim.splat.light import bounce, bounce_text
 from spacesim.splat.light import model as light_module
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.encoding import Encoding
@@ -507,6 +507,7 @@ def test_rays_of_a_turn_are_summed_up_one_after_another(monkeypatch):
     scatterers = bounce.Scatterers(splats.features, light.config.field.features, light.config.albedos, ad.Array3f(SUN))
     emitted = [upload(np.random.default_rng(5).uniform(size=8 * emitters))]
     batch, received = PaddedBatch.of(300), []
+    parts = bounce.Parts(front=True, mirrored=True)
     for turn in (1, 3, 4):
         monkeypatch.setattr(bounce, "TURN", dict.fromkeys(bounce.TURN, turn))
         rows = bounce.received_on_seen(
@@ -516,13 +517,42 @@ def test_rays_of_a_turn_are_summed_up_one_after_another(monkeypatch):
             emitters,
             batch,
             directions=lambda rays: eye().directions_to(rays.repeat_last(splats.means)),
-            diffuse=True,
-            mirrors=True,
+            parts=parts,
         )
         received.append(np.stack([numbers(row) for row in rows]))
     assert (received[0][:, :300].max(axis=1) > 0).all()
     np.testing.assert_array_equal(received[1], received[0])
     np.testing.assert_array_equal(received[2], received[0])
+
+
+@pytest.mark.threads
+@pytest.mark.parametrize("count", [1, 63, 300])
+def test_light_along_rays_is_the_same_by_a_kernel_of_text(count):
+    if select() != "llvm":
+        pytest.skip("such kernels are a CPU's")
+    light, splats = model("gloss"), gaussians(300, model("gloss").config.features)
+    around, emitters = light.surroundings(splats), light.config.bounce
+    scatterers = bounce.Scatterers(splats.features, light.config.field.features, light.config.albedos, ad.Array3f(SUN))
+    emitted = [upload(np.random.default_rng(5).uniform(size=8 * emitters))]
+    numbers_of = np.arange(300 - count, 300)  # the last, whose rays are at the end of an array, among them
+    batch = PaddedBatch.of_chosen(chosen(numbers_of, 300), 512, 300)
+
+    def directions(rays: PaddedBatch):
+        return eye().directions_to(rays.repeat_last(splats.means))
+
+    every = [bounce.SIDES, *(bounce.Parts(front, False, mirrored) for front, mirrored in ((1, 0), (0, 1), (1, 1)))]
+    for parts in every:
+        if parts is bounce.SIDES:
+            usual = bounce.received_on_sides(scatterers, around, emitted, emitters, batch)
+            rays = bounce.rays_on_sides(scatterers, around, batch)
+        else:
+            usual = bounce.received_on_seen(scatterers, around, emitted, emitters, batch, directions, parts)
+            rays = bounce.rays_on_seen(scatterers, around, batch, directions(batch))
+        found = bounce_text.gather_light(around, emitted, emitters, rays, parts)
+        assert len(found) == len(usual) == 3 * parts.count
+        exact = np.stack([numbers(row)[:count] for row in usual])
+        assert exact.max() > 0
+        np.testing.assert_allclose(np.stack([numbers(row)[:count] for row in found]), exact, rtol=2e-5, atol=1e-7)
 
 
 def difference(function) -> float:

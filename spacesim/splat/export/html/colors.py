@@ -25,7 +25,8 @@ from spacesim.splat.export.html.sunlight import octahedral_directions, quantized
 from spacesim.splat.light.field import field_color
 from spacesim.splat.light.model import LightModel
 from spacesim.splat.light.padded_batch import PaddedBatch
-from spacesim.splat.light.shading.forward import first_layer_of_features, split_weights
+from spacesim.splat.light.shading.forward import split_weights
+from spacesim.splat.light.shading.pictures import first_layer_of_features
 from spacesim.splat.light.sunlight import Sunlight
 from spacesim.splat.raster.cameras import Orthographic, OrthographicCamera
 from spacesim.splat.raster.gaussians import Gaussians

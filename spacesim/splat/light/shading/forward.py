@@ -1,17 +1,16 @@
-"""Colours and visibility of Gaussians, in training and for pictures."""
+"""Colours and visibility of Gaussians in training."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
 from spacesim.backend import ad, recorded
 from spacesim.backend.arrays import Float, TensorXf
 from spacesim.learning.networks import fused, mlp, network, tensor_cores
-from spacesim.learning.networks.network import round_up_rows
-from spacesim.splat.light import cooperative
-from spacesim.splat.light.bounce import received_on_sides
+from spacesim.splat.light.bounce import Parts, Rays
+from spacesim.splat.light.bounce_text import gather_light
 from spacesim.splat.light.config import LightConfig
-from spacesim.splat.light.field import FieldConfig, field_color, field_items, field_views, is_back_side_seen, sun_facing
+from spacesim.splat.light.field import field_color, field_items, field_views, sun_facing
 from spacesim.splat.light.padded_batch import PaddedBatch
 from spacesim.splat.light.shading.inputs import ShadingInputs
 from spacesim.splat.light.shading.scattering import (
@@ -21,11 +20,11 @@ from spacesim.splat.light.shading.scattering import (
     painted_items,
     received_light,
     scattered_light,
-    scatterers_of,
+    seen_rays,
     shares_of,
 )
 from spacesim.splat.light.shadow.refine import refine_occlusion
-from spacesim.splat.light.sunlight import SunEncoding, Sunlight
+from spacesim.splat.light.sunlight import SunEncoding
 from spacesim.splat.raster.seen import Chosen
 
 
@@ -41,7 +40,7 @@ class ShadingTape:
     scattered: list[Float]  #: of `scattered_light`, [M] each, or nothing
 
 
-_Read = tuple[TensorXf, network.InputLayer]
+Read = tuple[TensorXf, network.InputLayer]
 """Items of a network, its first layer."""
 
 
@@ -49,9 +48,10 @@ _Read = tuple[TensorXf, network.InputLayer]
 class _NetworkInputs:
     """What networks read that are computed by launches."""
 
-    field: _Read
-    refinement: _Read | None  #: where there is one
+    field: Read
+    refinement: Read | None  #: where there is one
     painted: TensorXf | None  #: of `painted_items`, where emitters are
+    rays: Rays | None  #: of `seen_rays`, where there are some
 
 
 @dataclass
@@ -80,29 +80,39 @@ def shade(
             launched.refinement = forward(refine.shape, of_refinement, *read.refinement)
         if read.painted is not None:
             launched.painted = fused.outputs(shape, of_field, read.painted, read.field[1]).outputs
+        if read.rays and inputs.surroundings:
+            lit = _in_sunlight(config, weights, inputs, batch, launched)
+            light = gather_light(inputs.surroundings, lit.emitted, config.bounce, read.rays, _arriving(config))
+            return _shaded(lit, *_with_scattered(config, inputs, batch, lit.outputs, light))
     return _shade(config, weights, inputs, batch, launched)
+
+
+def _arriving(config: LightConfig) -> Parts:
+    """Of the light that bounces, what Gaussians reflect."""
+    return Parts(front=True, mirrored=config.mirrors)
 
 
 @recorded
 def _network_inputs(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, of_all: bool
 ) -> _NetworkInputs:
-    """of_all: for all networks, or for the field's pass over the batch alone"""
+    """of_all: all of it, or of the field alone"""
     of_field, of_refinement = split_weights(config, weights)
     items = field_items(config.field, inputs.features, field_views(config.field, inputs.of_field(), batch), batch)
-    refine_items = _refine_items(config, inputs, batch) if of_all else None
-    painted = painted_items(config, inputs, batch.count) if of_all and _is_painted(config, inputs) else None
+    refine_items = items_of_refinement(config, inputs, batch) if of_all else None
+    painted = painted_items(config, inputs, batch.count) if of_all and is_painted(config, inputs) else None
     first = mlp.make_input_layer(config.field.shape, of_field, inputs.sun.field_encoding)
-    of_refine = None if refine_items is None else (refine_items, _refine_layer(config, of_refinement, inputs))
-    return _NetworkInputs((items, first), of_refine, painted)
+    of_refine = None if refine_items is None else (refine_items, refine_layer(config, of_refinement, inputs))
+    rays = seen_rays(config, inputs, batch) if of_all and inputs.surroundings else None
+    return _NetworkInputs((items, first), of_refine, painted, rays)
 
 
-def _is_painted(config: LightConfig, inputs: ShadingInputs) -> bool:
+def is_painted(config: LightConfig, inputs: ShadingInputs) -> bool:
     """Whether emitters are as the field paints them."""
     return config.mirrors and inputs.surroundings is not None
 
 
-def _refine_layer(config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs) -> network.InputLayer:
+def refine_layer(config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs) -> network.InputLayer:
     """First layer of the refinement."""
     assert config.refine is not None, "there is one"
     return mlp.make_input_layer(config.refine.shape, refine_weights, inputs.sun.refine_encoding)
@@ -117,194 +127,66 @@ def _shade(
     launched: _Launched,
 ) -> tuple[list[Float], list[Float], ShadingTape]:
     """`shade`, with what launches have made."""
+    lit = _in_sunlight(config, weights, inputs, batch, launched)
+    light = received_light(config, inputs, lit.emitted, batch, _arriving(config))
+    return _shaded(lit, *_with_scattered(config, inputs, batch, lit.outputs, light))
+
+
+@dataclass
+class _Lit:
+    """Gaussians as the Sun alone lights them."""
+
+    outputs: list[Float]  #: dimmed colours, then visibility, if there is one, [M] each
+    emitted: list[Float]  #: of `emitted_light`
+    tape: ShadingTape  #: with no scattered light
+
+
+@recorded
+def _in_sunlight(
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, launched: _Launched
+) -> _Lit:
     field_weights, refine_weights = split_weights(config, weights)
     field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
     # written in one kernel with the field's, if any are
-    refine_items = launched.refinement.tape.values[0] if launched.refinement else _refine_items(config, inputs, batch)
+    refine_items = (
+        launched.refinement.tape.values[0] if launched.refinement else items_of_refinement(config, inputs, batch)
+    )
     by_field, encoding = launched.field, inputs.sun.field_encoding
     items = by_field.tape.values[0] if by_field else field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, launched=by_field)
     colors = [field_color(config.decoding, value) for value in output]
-    occlusion, refine_tape = _refine_occlusion(config, refine_weights, inputs, batch, refine_items, launched.refinement)
+    occlusion, refine_tape = occlusion_and_tape(
+        config, refine_weights, inputs, batch, refine_items, launched.refinement
+    )
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     visibility = [1 - value for value in occlusion]
-    outputs = _dimmed(inputs.sun, colors, visibility, faces)
+    outputs = dimmed(inputs.sun, colors, visibility, faces)
     dr.eval(outputs, colors, occlusion, visibility, faces)
     shares = _emitters_shares(config, refine_weights, inputs, batch, visibility)
     first, painted = field_tape.input_layer, launched.painted
     emitted = emitted_light(config, field_weights, inputs, shares, batch, first, painted)
-    light = received_light(config, inputs, emitted, batch, diffuse=True, mirrors=config.mirrors)
+    return _Lit(outputs, emitted, ShadingTape(field_tape, refine_tape, colors, occlusion, faces, []))
+
+
+@recorded
+def _with_scattered(
+    config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch, outputs: list[Float], light: list[Float]
+) -> tuple[list[Float], list[Float]]:
+    """(outputs [N] each, what is scattered). outputs: of `_Lit`;  light: of `received_light`"""
     scattered = scattered_light(config, inputs, light[:3], light[3:], batch)
     if scattered:
         outputs = add_scattered(config, inputs, outputs, scattered, batch)
         dr.eval(outputs, scattered)
-    outputs = batch.unpad(outputs, inputs.means.x)
-    return outputs[:3], outputs[3:], ShadingTape(field_tape, refine_tape, colors, occlusion, faces, scattered)
+    return batch.unpad(outputs, inputs.means.x), scattered
 
 
-def shade_picture(
-    config: LightConfig,
-    field_weights: list[Float],
-    inputs: ShadingInputs,
-    batch: PaddedBatch,
-    first_layer: network.PartialLayer | None,
-    packed: cooperative.PackedNetwork | None,
-    sunlight: Sunlight,
-) -> list[Float]:
-    """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
-    launched = None
-    if first_layer and fused.takes(config.field.shape):
-        read = _picture_inputs(config, field_weights, inputs, batch, first_layer.inputs)
-        launched = _outputs(config.field.shape, field_weights, read, first_layer)
-    return _shade_picture(config, field_weights, inputs, batch, first_layer, packed, launched, sunlight)
+def _shaded(lit: _Lit, outputs: list[Float], scattered: list[Float]) -> tuple[list[Float], list[Float], ShadingTape]:
+    """What `shade` gives, of `_with_scattered`."""
+    return outputs[:3], outputs[3:], replace(lit.tape, scattered=scattered)
 
 
-def _outputs(
-    shape: network.MlpShape, weights: list[Float], read: _Read, known: network.PartialLayer | None = None
-) -> TensorXf | None:
-    """By a launch; None where gradients are asked for, which it would not know of."""
-    if dr.grad_enabled(read, weights, [known.values] if known else []):
-        return None
-    return fused.outputs(shape, weights, *read, known).outputs
-
-
-@recorded
-def _picture_inputs(
-    config: LightConfig, field_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, known: int
-) -> _Read:
-    """Of the field's inputs but for so many first ones."""
-    views = field_views(config.field, inputs.of_field(), batch)
-    layer = mlp.make_input_layer(config.field.shape, field_weights, inputs.sun.field_encoding, known)
-    return batch.matrix(views, round_up_rows(len(views))), layer
-
-
-@recorded
-def _shade_picture(
-    config: LightConfig,
-    field_weights: list[Float],
-    inputs: ShadingInputs,
-    batch: PaddedBatch,
-    first_layer: network.PartialLayer | None,
-    packed: cooperative.PackedNetwork | None,
-    launched: TensorXf | None,
-    sunlight: Sunlight,
-) -> list[Float]:
-    """launched: what the field says, if that is known"""
-    field, field_inputs = config.field, inputs.of_field()
-    views = field_views(field, field_inputs, batch)
-    if launched is not None:
-        outputs = [network.row_of(launched, i) for i in range(field.shape.outputs)]
-    elif packed is None:
-        assert first_layer is not None, "one of the two"
-        items = batch.matrix(views, round_up_rows(len(views)))
-        outputs, _ = mlp.forward(field.shape, field_weights, items, inputs.sun.field_encoding, first_layer)
-    else:
-        rows = batch.block(inputs.features, 0, field.features) + views
-        outputs = cooperative.forward(field.shape, packed, rows, inputs.sun.field_encoding)
-    colors = [field_color(config.decoding, value) for value in outputs]
-    faces = sun_facing(field, field_inputs, views, batch)
-    visibility = [] if sunlight.visibility is None else [batch.pad_zeros(sunlight.visibility)]
-    shown = _dimmed(inputs.sun, colors, visibility, faces)
-    bounced = [batch.pad_zeros(light) for light in sunlight.bounced]
-    if bounced:
-        over = is_back_side_seen(field, field_inputs, batch)
-        bounced = [dr.select(over, bounced[3 + c], bounced[c]) for c in range(3)]
-    mirrored = received_light(config, inputs, sunlight.emitted, batch, diffuse=False, mirrors=True)
-    scattered = scattered_light(config, inputs, bounced, mirrored, batch)
-    if scattered:
-        shown = add_scattered(config, inputs, shown, scattered, batch)
-    dr.eval(shown)
-    return batch.unpad(shown, inputs.means.x)
-
-
-def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
-    """Of the Sun, refined, [N]."""
-    _, refine_weights = split_weights(config, weights)
-    launched = None
-    if config.refine and fused.takes(config.refine.shape):
-        read = _refine_inputs(config, refine_weights, inputs, batch)
-        launched = _outputs(config.refine.shape, refine_weights, read)
-    return _refined_visibility(config, refine_weights, inputs, batch, launched)
-
-
-@recorded
-def _refine_inputs(
-    config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> _Read:
-    items = _refine_items(config, inputs, batch)
-    assert items is not None, "there is a refinement"
-    return items, _refine_layer(config, refine_weights, inputs)
-
-
-@recorded
-def _refined_visibility(
-    config: LightConfig,
-    refine_weights: list[Float],
-    inputs: ShadingInputs,
-    batch: PaddedBatch,
-    launched: TensorXf | None,
-) -> Float:
-    """launched: what the refinement says, if that is known"""
-    if launched is None or config.refine is None:
-        items = _refine_items(config, inputs, batch)
-        (occlusion,), _ = _refine_occlusion(config, refine_weights, inputs, batch, items)
-    else:
-        (raw,) = _raw_occlusion(inputs, batch)
-        occlusion = refine_occlusion(config.refine, raw, network.row_of(launched, 0))
-    visibility = 1 - occlusion
-    dr.eval(visibility)
-    return batch.unpad([visibility], inputs.means.x)[0]
-
-
-def scatter_sunlight(
-    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, visibility: list[Float]
-) -> tuple[list[Float], list[Float]]:
-    """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
-    field_weights, _ = split_weights(config, weights)
-    painted = None
-    if _is_painted(config, inputs) and fused.takes(config.field.shape):
-        painted = _outputs(config.field.shape, field_weights, _painted_inputs(config, field_weights, inputs, batch))
-    return _scatter_sunlight(config, field_weights, inputs, batch, visibility, painted)
-
-
-@recorded
-def _painted_inputs(
-    config: LightConfig, field_weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch
-) -> _Read:
-    first = mlp.make_input_layer(config.field.shape, field_weights, inputs.sun.field_encoding)
-    return painted_items(config, inputs, batch.count), first
-
-
-@recorded
-def _scatter_sunlight(
-    config: LightConfig,
-    field_weights: list[Float],
-    inputs: ShadingInputs,
-    batch: PaddedBatch,
-    visibility: list[Float],
-    painted: TensorXf | None,
-) -> tuple[list[Float], list[Float]]:
-    """painted: what the field says of `painted_items`, if that is known"""
-    shares = shares_of(inputs, visibility)
-    emitted = emitted_light(config, field_weights, inputs, shares, batch, painted=painted)
-    bounced: list[Float] = []
-    if emitted and inputs.surroundings:
-        scatterers = scatterers_of(config, inputs)
-        bounced = received_on_sides(scatterers, inputs.surroundings, emitted, config.bounce, batch)
-    dr.eval(bounced)
-    return batch.unpad(bounced, inputs.means.x), emitted if config.mirrors else []
-
-
-@recorded
-def first_layer_of_features(
-    field: FieldConfig, weights: list[Float], features: Float, batch: PaddedBatch
-) -> network.PartialLayer:
-    items = batch.matrix(batch.block(features, 0, field.features), round_up_rows(field.features))
-    return mlp.first_layer_part(field.shape, weights, items, field.features)
-
-
-def _dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
+def dimmed(sun: SunEncoding, colors: list[Float], visibility: list[Float], faces: list[Float]) -> list[Float]:
     """Colours [M] dimmed by the Earth and by visibility ([M] in a list, or nothing), then that as it is shown. faces:
     of `sun_facing`"""
     if not visibility:
@@ -318,12 +200,12 @@ def picture_visibility(visibility: Float, faces: list[Float]) -> Float:
     return visibility * faces[0] if faces else visibility
 
 
-def _refine_items(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf | None:
+def items_of_refinement(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> TensorXf | None:
     """Inputs of the refinement, TensorXf [B, C, m], where there is one."""
     return inputs.refine_items(config.refine, config.field.stored, batch) if config.refine else None
 
 
-def _refine_occlusion(
+def occlusion_and_tape(
     config: LightConfig,
     refine_weights: list[Float],
     inputs: ShadingInputs,
@@ -331,8 +213,8 @@ def _refine_occlusion(
     items: TensorXf | None,
     launched: network.Launched | None = None,
 ) -> tuple[list[Float], network.MlpTape | None]:
-    """([refined occlusion [M]] or [], tape of the refinement). items: of `_refine_items`;  launched: of these"""
-    occlusion = _raw_occlusion(inputs, batch)
+    """([refined occlusion [M]] or [], tape of the refinement). items: of `refine_items`;  launched: of these"""
+    occlusion = raw_occlusion(inputs, batch)
     if not config.refine:
         return occlusion, None
     assert items is not None, "the refinement has inputs"
@@ -341,7 +223,7 @@ def _refine_occlusion(
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
 
-def _raw_occlusion(inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
+def raw_occlusion(inputs: ShadingInputs, batch: PaddedBatch) -> list[Float]:
     """[M] in a list, or nothing."""
     return [batch.pad_zeros(row) for row in inputs.raw_shadows[:1]]
 
@@ -354,8 +236,8 @@ def _emitters_shares(
         return shares_of(inputs, visible)
     emitters = Chosen(ad.UInt32(config.bounce), inputs.surroundings.emitters, None)
     columns = PaddedBatch.with_room_for(config.bounce, batch.count, emitters)
-    items = _refine_items(config, inputs, columns)
-    occlusion, _ = _refine_occlusion(config, refine_weights, inputs, columns, items)
+    items = items_of_refinement(config, inputs, columns)
+    occlusion, _ = occlusion_and_tape(config, refine_weights, inputs, columns, items)
     dr.eval(occlusion)
     return lambda k: [1 - dr.gather(ad.Float, value, k) for value in occlusion]
 

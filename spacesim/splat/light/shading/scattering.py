@@ -9,6 +9,8 @@ from spacesim.backend.arrays import Float, TensorXf, UInt32
 from spacesim.learning.networks import mlp, network
 from spacesim.learning.reflectance import surface_cosines
 from spacesim.splat.light.bounce import (
+    Parts,
+    Rays,
     Scatterers,
     add_irradiance,
     add_irradiance_slopes,
@@ -17,6 +19,7 @@ from spacesim.splat.light.bounce import (
     grazing_reflectance,
     grazing_reflectance_slope,
     lit_normals,
+    rays_on_seen,
     received_on_seen,
 )
 from spacesim.splat.light.config import LightConfig
@@ -88,13 +91,20 @@ def shares_of(inputs: ShadingInputs, visibility: list[Float]) -> Shares:
 
 
 def received_light(
-    config: LightConfig, inputs: ShadingInputs, emitted: list[Float], batch: PaddedBatch, diffuse: bool, mirrors: bool
+    config: LightConfig, inputs: ShadingInputs, emitted: list[Float], batch: PaddedBatch, parts: Parts
 ) -> list[Float]:
     """Of `received_on_seen`; nothing where nothing is emitted."""
     if not emitted or inputs.surroundings is None:
         return []
     scatterers, directions, around = scatterers_of(config, inputs), inputs.of_field().directions, inputs.surroundings
-    return received_on_seen(scatterers, around, emitted, config.bounce, batch, directions, diffuse, mirrors)
+    return received_on_seen(scatterers, around, emitted, config.bounce, batch, directions, parts)
+
+
+def seen_rays(config: LightConfig, inputs: ShadingInputs, batch: PaddedBatch) -> Rays:
+    """Along which that light arrives."""
+    assert inputs.surroundings is not None, "something is emitted"
+    direction = inputs.of_field().directions(batch)
+    return rays_on_seen(scatterers_of(config, inputs), inputs.surroundings, batch, direction)
 
 
 def painted_items(config: LightConfig, inputs: ShadingInputs, gaussians: UInt32) -> TensorXf:
