@@ -63,7 +63,7 @@ class Rays:
     direction: Array3f | None  #: [3, M], unit, from the camera; None: none is mirrored
 
 
-SIDES = Parts(front=True, back=True)
+SIDES = Parts(front=True, back=True)  #: of light that arrives, what does not depend on the viewer
 
 
 def rays_on_sides(scatterers: Scatterers, surroundings: Surroundings, batch: PaddedBatch) -> Rays:

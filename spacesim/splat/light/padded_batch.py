@@ -9,6 +9,7 @@ from spacesim.backend import ad
 from spacesim.backend.arrays import Bool, Float, TensorXf, UInt32
 from spacesim.backend.upload import held
 from spacesim.learning.networks.network import CHUNK
+from spacesim.splat.raster.lists.boxes import divided
 from spacesim.splat.raster.lists.tiles import round_capacity
 from spacesim.splat.raster.seen import Chosen
 
@@ -98,7 +99,7 @@ class PaddedBatch:
     def pack(self, parts: list[tuple[TensorXf, int, int]], like: Float) -> Float:
         """Float [C * N], packed, of parts (TensorXf [B, R, m], first row, rows), one under another. like: an array."""
         place = dr.arange(ad.UInt32, dr.width(like))
-        row, column = place // self.count, place % self.count
+        row, column = divided(place, self.count)
         is_chosen = ad.Bool(True)
         if self.chosen:
             column = self.chosen.place_of(column)

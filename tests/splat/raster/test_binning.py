@@ -292,9 +292,20 @@ def test_quotients_of_floats_are_those_of_integers():
     by = rng.integers(1, 4097, 200_000)
     number = np.minimum(rng.integers(0, 4096, by.size) * by + rng.integers(-1, 2, by.size), 2**24 - 1)
     by, number = np.append(by, [1, 2**12, 3]), np.append(np.maximum(number, 0), [2**24 - 1] * 3)
-    down, across = boxes._divided(upload(number.astype(np.uint32), ad.UInt32), upload(by.astype(np.float32), ad.Float))
+    down, across = boxes.divided(upload(number.astype(np.uint32), ad.UInt32), upload(by.astype(np.float32), ad.Float))
     np.testing.assert_array_equal(np.array(down), number // by)
     np.testing.assert_array_equal(np.array(across), number % by)
+
+
+def test_quotients_of_large_numbers_are_those_of_integers():
+    """Of rows of millions, too."""
+    rng = np.random.default_rng(0)
+    by = rng.integers(2**11, 2**31, 200_000)
+    quotient = rng.integers(0, np.minimum(2**21, (2**32 - 1) // by))
+    number = np.clip(quotient * by + rng.integers(-1, 2, by.size), 0, 2**32 - 1)
+    down, rest = boxes.divided(*(upload(values.astype(np.uint32), ad.UInt32) for values in (number, by)))
+    np.testing.assert_array_equal(np.array(down), number // by)
+    np.testing.assert_array_equal(np.array(rest), number % by)
 
 
 def test_pairs_are_numbered_in_few_bits_where_they_fit(way):

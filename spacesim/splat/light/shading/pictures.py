@@ -36,7 +36,7 @@ from spacesim.splat.light.shading.scattering import (
 from spacesim.splat.light.shadow.refine import refine_occlusion
 from spacesim.splat.light.sunlight import Sunlight
 
-MIRRORED = Parts(mirrored=True)  #: of light that arrives, what depends on the viewer
+MIRRORED = Parts(mirrored=True)  #: what does
 
 
 def shade_picture(

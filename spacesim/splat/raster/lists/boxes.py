@@ -87,7 +87,7 @@ def tile_of_pair(ellipse: list[Float], within: UInt32, exists: Bool | bool, grid
     """Tile [P] of the pair `within` the box of a splat; the number of tiles where there is no such pair, or the ellipse
     misses the tile. ellipse: the numbers of `find_boxes`"""
     *form, corner, columns = ellipse
-    first, (down, across) = cast(UInt32, dr.reinterpret_array(ad.UInt32, corner)), _divided(within, columns)
+    first, (down, across) = cast(UInt32, dr.reinterpret_array(ad.UInt32, corner)), divided(within, columns)
     column, row = (first & 0xFFFF) + across, (first >> 16) + down
     listed = _touches(form, column, row, grid.shape) & exists
     return dr.select(listed, row * grid.columns + column, grid.tiles)
@@ -114,9 +114,10 @@ def each_tile(
     dr.while_loop((lane,), has_more, visit_one, mode="symbolic", label="tiles of splats")
 
 
-def _divided(number: UInt32, by: Float) -> tuple[UInt32, UInt32]:
-    """(quotient, rest) of numbers by whole ones, both below 2^24. On LLVM integers would be divided one by one."""
-    quotient, divisor = ad.UInt32((ad.Float(number) + 0.5) / by), ad.UInt32(by)
+def divided(number: UInt32, by: Float | UInt32) -> tuple[UInt32, UInt32]:
+    """(quotient, below 2^21, rest) of whole numbers, Floats below 2^24. On LLVM integers would be divided one by
+    one."""
+    quotient, divisor = ad.UInt32((ad.Float(number) + 0.5) / ad.Float(by)), ad.UInt32(by)
     rest = number - quotient * divisor
     quotient = dr.select(rest >= 2**31, quotient - 1, dr.select(rest >= divisor, quotient + 1, quotient))  # rounded
     return quotient, number - quotient * divisor
