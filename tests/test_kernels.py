@@ -115,6 +115,16 @@ def test_no_recording_takes_a_launch_in():
     double([upload(np.ones(3, np.float32))])
     assert seen == [False]
     assert is_usable()
+    kernel, result = LlvmKernel(["result"], [], ("write", lambda text: None)), empty(ad.Float, 3)
+
+    @recorded
+    def launch(values: list) -> list:
+        kernel([1], [result], [])
+        return values
+
+    with pytest.raises(RuntimeError, match="while recording") as raised:
+        launch([upload(np.ones(3, np.float32))])
+    assert "launched between recordings" in str(raised.value.__cause__)
 
 
 def test_without_the_library_dr_jit_computes(monkeypatch, caplog):

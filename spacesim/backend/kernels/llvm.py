@@ -54,8 +54,9 @@ class LlvmKernel:
         counts: of the stages, above 0;  arrays: of Dr.Jit's, made opaque here, those to be written of `empty`
         """
         assert (len(arrays), len(numbers), len(counts)) == self._takes
-        threads = self._threads
-        load_drjit().make_opaque(arrays)  # a literal has no memory of its own
+        dr, threads = load_drjit(), self._threads
+        assert not dr.flag(dr.JitFlag.FreezingScope), "kernels of text are launched between recordings"
+        dr.make_opaque(arrays)  # a literal has no memory of its own
         with one_at_a_time:
             while _launched and _launched[0][_DONE]:
                 _launched.popleft()

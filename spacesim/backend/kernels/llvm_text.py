@@ -221,9 +221,9 @@ class Text:
         return self.value(FLOAT, f"call float {call}")
 
     def maximum(self, x: Value, y: Value | float) -> Value:
-        """The larger of two float32, or of each pair of two vectors; the second where one is no number."""
+        """The larger of two float32, or of each pair of two vectors; the first where one is no number."""
         other = x.like(y)
-        return (other < x).choose(x, other)
+        return (x < other).choose(other, x)
 
     def rcp(self, x: Value) -> Value:
         """1 / x."""

@@ -15,8 +15,8 @@ PANEL = 64  #: columns that go through all layers together
 PER_CHUNK = CHUNK // PANEL
 BLOCK, SMALL_BLOCK = (4, 4), (6, 1)  #: rows and vectors that registers sum up at once, of 16 and of fewer numbers
 
-Read = Callable[[Value, Value], Value]
-"""A matrix's number, or its vector of numbers, by row and column."""
+Entry = Callable[[Value, Value], Value]
+"""A matrix's number by row and column."""
 
 
 def full(rows: int) -> int:
@@ -83,7 +83,7 @@ class FusedText:
     ) -> None:
         """What layer i says of a panel. source: array and place of what it reads;  to: those of what it says, and the
         stride of its rows;  known: place of what it says of other inputs, if it does"""
-        target, start, stride = to
+        (target, start, stride), nothing = to, text.zeros(LANES)
 
         def begin(row: Value, vector: int) -> Value:
             bias = text.spread(text.load_floats(f"bias{i}", row), LANES)
@@ -92,7 +92,7 @@ class FusedText:
             return bias + text.load_floats("known", known + row * CHUNK + vector * LANES, LANES)
 
         def end(row: Value, vector: int, value: Value) -> None:
-            said = value if target == "output" else _positive(text, value, value)
+            said = value if target == "output" else (value < nothing).choose(nothing, value)  # NaN stays
             text.store(target, start + row * stride + vector * LANES, said)
 
         size, left = (self.shape.sizes[i][0], columns), self._matrix(text, f"matrix{i}", columns)
@@ -221,7 +221,7 @@ class FusedText:
         self,
         text: Text,
         size: tuple[int, int],
-        left: Read,
+        left: Entry,
         right: Callable[[Value, int], Value],
         begin: Callable[[Value, int], Value],
         end: Callable[[Value, int, Value], None],
@@ -263,7 +263,7 @@ class FusedText:
                 text.store(room, loop.at * PANEL + vector, value)
 
     @staticmethod
-    def _matrix(text: Text, array: str, columns: int) -> Read:
+    def _matrix(text: Text, array: str, columns: int) -> Entry:
         return lambda row, column: text.load_floats(array, row * columns + column)
 
 

@@ -63,13 +63,13 @@ class Rays:
     direction: Array3f | None  #: [3, M], unit, from the camera; None: none is mirrored
 
 
-SIDES = Parts(front=True, back=True)  #: of light that arrives, what does not depend on the viewer
+BOTH_SIDES = Parts(front=True, back=True)  #: of light that arrives, what does not depend on the viewer
 
 
 def rays_on_sides(scatterers: Scatterers, surroundings: Surroundings, batch: PaddedBatch) -> Rays:
     """All rays of the batch's Gaussians."""
     begin, *_, end = _bounds(surroundings, batch)
-    return Rays(begin, end, _normals(scatterers, batch), None)
+    return Rays(begin, _of_real(batch, begin, end), _normals(scatterers, batch), None)
 
 
 def rays_on_seen(scatterers: Scatterers, surroundings: Surroundings, batch: PaddedBatch, direction: Array3f) -> Rays:
@@ -77,7 +77,13 @@ def rays_on_seen(scatterers: Scatterers, surroundings: Surroundings, batch: Padd
     normals = _normals(scatterers, batch)
     away, normals = points_away(normals, direction), seen_side_normals(normals, direction)
     begin, behind, past, end = _bounds(surroundings, batch)
-    return Rays(dr.select(away, behind, begin), dr.select(away, end, past), normals, direction)
+    begin, end = dr.select(away, behind, begin), dr.select(away, end, past)
+    return Rays(begin, _of_real(batch, begin, end), normals, direction)
+
+
+def _of_real(batch: PaddedBatch, begin: UInt32, end: UInt32) -> UInt32:
+    """The end of each Gaussian's rays; columns that are no Gaussian's have none."""
+    return dr.select(batch.is_real(), end, begin)
 
 
 def received_on_sides(
@@ -87,7 +93,7 @@ def received_on_sides(
     each. emitted: of `emission`, by so many `emitters`"""
     sorted_ = _sorted_batch(surroundings, batch)
     rays = rays_on_sides(scatterers, surroundings, sorted_)
-    return _in_columns(_gathered(surroundings, emitted, emitters, rays, SIDES), sorted_, batch)
+    return _in_columns(_gathered(surroundings, emitted, emitters, rays, BOTH_SIDES), sorted_, batch)
 
 
 def received_on_seen(

@@ -96,16 +96,32 @@ def test_any_number_of_threads_gives_the_same_bits(threads):
 @pytest.mark.parametrize("width", [4, 8, 16])
 def test_registers_of_any_width_give_the_same_bits(width, monkeypatch):
     case = Case(ALL["odd"], 700)
-    usual, kernels = bits(passes(case)), (fused._forward_kernel, fused._backward_kernel)
+    kernels = fused._forward_kernel, fused._outputs_kernel, fused._backward_kernel
+    weights, rows, shared, _, batch = case.device()
+    items = batch.matrix([batch.pad_zeros(row) for row in rows], case.shape.rows)
+    first = mlp.make_input_layer(case.shape, weights, shared)
+
+    def outputs() -> bytes:
+        return numbers(fused.outputs(case.shape, weights, items, first).outputs).tobytes()
+
+    usual, alone = bits(passes(case)), outputs()
     assert fused.vector_width() in (4, 8, 16)
     monkeypatch.setattr(fused, "vector_width", lambda: width)
     for kernel in kernels:
         kernel.cache_clear()
     try:
         assert bits(passes(case)) == usual
+        assert outputs() == alone
     finally:
         for kernel in kernels:
             kernel.cache_clear()
+
+
+def test_what_is_no_number_stays_so():
+    case = Case(ALL["demo"], 3)
+    case.items[:, 1] = np.nan
+    output, _, _ = passes(case)
+    assert np.isnan(columns(output, 3)).tolist() == [[False, True, False]] * 3
 
 
 def test_what_is_not_taken():

@@ -11,6 +11,7 @@ from scipy.special import sph_harm_y
 from splats import light_of, met_along, srgb_of
 
 from spacesim.backend import ad, select
+from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
@@ -28,6 +29,8 @@ from spacesim.splat.light.encoding import Encoding
 from spacesim.splat.light.field import DirectionsConfig, FieldConfig, SurfaceConfig, ViewAloneConfig
 from spacesim.splat.light.model import LightModel, TrainingFrame
 from spacesim.splat.light.padded_batch import PaddedBatch
+from spacesim.splat.light.shading import forward as shading_forward
+from spacesim.splat.light.shading import pictures
 from spacesim.splat.light.shadow.cast import ShadowConfig, SplattingConfig
 from spacesim.splat.light.shadow.mapping import MappingConfig, occlusion_by_mapping
 from spacesim.splat.light.shadow.refine import ShadowRefinementConfig
@@ -345,7 +348,6 @@ def _products(request, monkeypatch) -> None:
     """As networks are computed: by a kernel each on a CPU, in one recording, and as those of 128 units and more on
     CUDA; on a CPU other products stand for those of its tensor cores."""
     if request.param == "the backend's way":
-        assert select() == "cuda" or fused.takes(FIELD.shape)
         return
     monkeypatch.setattr(fused, "takes", lambda shape: False)
     if request.param == "all at once":
@@ -540,9 +542,9 @@ def test_light_along_rays_is_the_same_by_a_kernel_of_text(count):
     def directions(rays: PaddedBatch):
         return eye().directions_to(rays.repeat_last(splats.means))
 
-    every = [bounce.SIDES, *(bounce.Parts(front, False, mirrored) for front, mirrored in ((1, 0), (0, 1), (1, 1)))]
+    every = [bounce.BOTH_SIDES, *(bounce.Parts(front, False, mirrored) for front, mirrored in ((1, 0), (0, 1), (1, 1)))]
     for parts in every:
-        if parts is bounce.SIDES:
+        if parts is bounce.BOTH_SIDES:
             usual = bounce.received_on_sides(scatterers, around, emitted, emitters, batch)
             rays = bounce.rays_on_sides(scatterers, around, batch)
         else:
@@ -553,6 +555,55 @@ def test_light_along_rays_is_the_same_by_a_kernel_of_text(count):
         exact = np.stack([numbers(row)[:count] for row in usual])
         assert exact.max() > 0
         np.testing.assert_allclose(np.stack([numbers(row)[:count] for row in found]), exact, rtol=2e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["relight", "map", "gloss"])
+def test_a_cpu_launches_networks_and_rays(name, monkeypatch):
+    if select() != "llvm" or not is_usable():
+        pytest.skip("such kernels are a CPU's")
+    light, launched = model(name), []
+    for module, function in (
+        *((fused, kernel) for kernel in ("forward", "backward", "outputs")),
+        *((module, "gather_light") for module in (shading_forward, pictures)),
+    ):
+        usual = getattr(module, function)
+        monkeypatch.setattr(module, function, lambda *of, f=function, u=usual: launched.append(f) or u(*of))
+
+    def launches() -> list[str]:
+        names = sorted(launched)
+        launched.clear()
+        return names
+
+    splats, refined, bounces = gaussians(60, light.config.features), bool(light.config.refine), light.config.bounce > 0
+    painted, rays = ["outputs"] * light.config.mirrors, ["gather_light"] * bounces
+    shading = light.shade(splats, eye(), SUN)
+    assert launches() == sorted(["forward"] * (1 + refined) + painted + rays)
+    light.adjoint(shading, [dr.opaque(ad.Float, 1, 60) for _ in range(3)])
+    assert launches() == ["backward"] * (1 + refined)
+    light.shade_picture(splats, eye(), SUN)
+    of_mirrors = ["gather_light"] * light.config.mirrors
+    assert launches() == sorted(["outputs"] * (1 + refined) + painted + rays + of_mirrors)
+
+
+@pytest.mark.parametrize("name", ["bounce", "gloss"])
+def test_pictures_change_with_the_light_that_arrives(name):
+    """What bounces, too; launches know of no gradients."""
+    light, share = model(name), np.random.default_rng(1).uniform(0.3, 0.7, 37)
+    splats = gaussians(37, light.config.features)
+
+    def shown(visibility) -> list:
+        return light.shade_picture(splats, eye(), SUN, light.arriving(splats, SUN, visibility))[0]
+
+    visibility, h = upload(share), 1e-2
+    dr.enable_grad(visibility)
+    dr.set_grad(visibility, ad.Float(1))
+    rows = shown(visibility)
+    dr.enqueue(dr.ADMode.Forward, visibility)
+    dr.traverse(dr.ADMode.Forward)
+    more, less = (np.stack([numbers(row) for row in shown(upload(share + step))]) for step in (h, -h))
+    slopes = (more - less) / (2 * h)
+    assert np.abs(slopes).max() > 0.01
+    np.testing.assert_allclose(np.stack([numbers(dr.grad(row)) for row in rows]), slopes, rtol=0.02, atol=2e-3)
 
 
 def difference(function) -> float:

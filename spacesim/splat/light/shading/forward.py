@@ -45,8 +45,8 @@ Read = tuple[TensorXf, network.InputLayer]
 
 
 @dataclass
-class _NetworkInputs:
-    """What networks read that are computed by launches."""
+class _LaunchInputs:
+    """What launches read."""
 
     field: Read
     refinement: Read | None  #: where there is one
@@ -55,8 +55,8 @@ class _NetworkInputs:
 
 
 @dataclass
-class _Launched:
-    """What launches have made of `_NetworkInputs`; None: the recording makes it."""
+class _Made:
+    """What launches have made of `_LaunchInputs`; None: the recording makes it."""
 
     field: network.Launched | None = None
     refinement: network.Launched | None = None
@@ -69,22 +69,22 @@ def shade(
     """(dimmed colours, [visibility] or [], tape)."""
     shape, refine, (of_field, of_refinement) = config.field.shape, config.refine, split_weights(config, weights)
     is_fused = fused.takes(shape) and (refine is None or fused.takes(refine.shape))
-    launched = _Launched()
+    made = _Made()
     if is_fused or tensor_cores.takes(shape, batch.capacity):
-        read = _network_inputs(config, weights, inputs, batch, is_fused)
-        if dr.grad_enabled(read, weights):  # which a launch would not know of
-            return _shade(config, weights, inputs, batch, launched)
+        read = _launch_inputs(config, weights, inputs, batch, is_fused)
+        if dr.grad_enabled(read, weights, inputs.raw_shadows):  # which a launch would not know of
+            return _shade(config, weights, inputs, batch, made)
         forward = fused.forward if is_fused else tensor_cores.forward
-        launched.field = forward(shape, of_field, *read.field)
+        made.field = forward(shape, of_field, *read.field)
         if read.refinement and refine:
-            launched.refinement = forward(refine.shape, of_refinement, *read.refinement)
+            made.refinement = forward(refine.shape, of_refinement, *read.refinement)
         if read.painted is not None:
-            launched.painted = fused.outputs(shape, of_field, read.painted, read.field[1]).outputs
+            made.painted = fused.outputs(shape, of_field, read.painted, read.field[1]).outputs
         if read.rays and inputs.surroundings:
-            lit = _in_sunlight(config, weights, inputs, batch, launched)
+            lit = _in_sunlight(config, weights, inputs, batch, made)
             light = gather_light(inputs.surroundings, lit.emitted, config.bounce, read.rays, _arriving(config))
             return _shaded(lit, *_with_scattered(config, inputs, batch, lit.outputs, light))
-    return _shade(config, weights, inputs, batch, launched)
+    return _shade(config, weights, inputs, batch, made)
 
 
 def _arriving(config: LightConfig) -> Parts:
@@ -93,9 +93,9 @@ def _arriving(config: LightConfig) -> Parts:
 
 
 @recorded
-def _network_inputs(
+def _launch_inputs(
     config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, of_all: bool
-) -> _NetworkInputs:
+) -> _LaunchInputs:
     """of_all: all of it, or of the field alone"""
     of_field, of_refinement = split_weights(config, weights)
     items = field_items(config.field, inputs.features, field_views(config.field, inputs.of_field(), batch), batch)
@@ -104,7 +104,7 @@ def _network_inputs(
     first = mlp.make_input_layer(config.field.shape, of_field, inputs.sun.field_encoding)
     of_refine = None if refine_items is None else (refine_items, refine_layer(config, of_refinement, inputs))
     rays = seen_rays(config, inputs, batch) if of_all and inputs.surroundings else None
-    return _NetworkInputs((items, first), of_refine, painted, rays)
+    return _LaunchInputs((items, first), of_refine, painted, rays)
 
 
 def is_painted(config: LightConfig, inputs: ShadingInputs) -> bool:
@@ -124,10 +124,10 @@ def _shade(
     weights: list[Float],
     inputs: ShadingInputs,
     batch: PaddedBatch,
-    launched: _Launched,
+    made: _Made,
 ) -> tuple[list[Float], list[Float], ShadingTape]:
     """`shade`, with what launches have made."""
-    lit = _in_sunlight(config, weights, inputs, batch, launched)
+    lit = _in_sunlight(config, weights, inputs, batch, made)
     light = received_light(config, inputs, lit.emitted, batch, _arriving(config))
     return _shaded(lit, *_with_scattered(config, inputs, batch, lit.outputs, light))
 
@@ -143,28 +143,24 @@ class _Lit:
 
 @recorded
 def _in_sunlight(
-    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, launched: _Launched
+    config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch, made: _Made
 ) -> _Lit:
     field_weights, refine_weights = split_weights(config, weights)
     field_inputs = inputs.of_field()
     views = field_views(config.field, field_inputs, batch)
     # written in one kernel with the field's, if any are
-    refine_items = (
-        launched.refinement.tape.values[0] if launched.refinement else items_of_refinement(config, inputs, batch)
-    )
-    by_field, encoding = launched.field, inputs.sun.field_encoding
+    refine_items = made.refinement.tape.values[0] if made.refinement else items_of_refinement(config, inputs, batch)
+    by_field, encoding = made.field, inputs.sun.field_encoding
     items = by_field.tape.values[0] if by_field else field_items(config.field, inputs.features, views, batch)
     output, field_tape = mlp.forward(config.field.shape, field_weights, items, encoding, launched=by_field)
     colors = [field_color(config.decoding, value) for value in output]
-    occlusion, refine_tape = occlusion_and_tape(
-        config, refine_weights, inputs, batch, refine_items, launched.refinement
-    )
+    occlusion, refine_tape = occlusion_and_tape(config, refine_weights, inputs, batch, refine_items, made.refinement)
     faces = sun_facing(config.field, field_inputs, views, batch) if occlusion else []
     visibility = [1 - value for value in occlusion]
     outputs = dimmed(inputs.sun, colors, visibility, faces)
     dr.eval(outputs, colors, occlusion, visibility, faces)
     shares = _emitters_shares(config, refine_weights, inputs, batch, visibility)
-    first, painted = field_tape.input_layer, launched.painted
+    first, painted = field_tape.input_layer, made.painted
     emitted = emitted_light(config, field_weights, inputs, shares, batch, first, painted)
     return _Lit(outputs, emitted, ShadingTape(field_tape, refine_tape, colors, occlusion, faces, []))
 
@@ -211,15 +207,15 @@ def occlusion_and_tape(
     inputs: ShadingInputs,
     batch: PaddedBatch,
     items: TensorXf | None,
-    launched: network.Launched | None = None,
+    made: network.Launched | None = None,
 ) -> tuple[list[Float], network.MlpTape | None]:
-    """([refined occlusion [M]] or [], tape of the refinement). items: of `refine_items`;  launched: of these"""
+    """([refined occlusion [M]] or [], tape of the refinement). items: of `refine_items`;  made: of these"""
     occlusion = raw_occlusion(inputs, batch)
     if not config.refine:
         return occlusion, None
     assert items is not None, "the refinement has inputs"
     encoding = inputs.sun.refine_encoding
-    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, encoding, launched=launched)
+    (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, encoding, launched=made)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 
 

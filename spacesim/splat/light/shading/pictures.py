@@ -7,7 +7,7 @@ from spacesim.backend.arrays import Float, TensorXf
 from spacesim.learning.networks import fused, mlp, network
 from spacesim.learning.networks.network import round_up_rows
 from spacesim.splat.light import cooperative
-from spacesim.splat.light.bounce import SIDES, Parts, Rays, rays_on_sides, received_on_sides
+from spacesim.splat.light.bounce import BOTH_SIDES, Parts, Rays, rays_on_sides, received_on_sides
 from spacesim.splat.light.bounce_text import gather_light
 from spacesim.splat.light.config import LightConfig
 from spacesim.splat.light.field import FieldConfig, field_color, field_views, is_back_side_seen, sun_facing
@@ -36,7 +36,7 @@ from spacesim.splat.light.shading.scattering import (
 from spacesim.splat.light.shadow.refine import refine_occlusion
 from spacesim.splat.light.sunlight import Sunlight
 
-MIRRORED = Parts(mirrored=True)  #: what does
+MIRRORED = Parts(mirrored=True)  #: of light that arrives, what depends on the viewer
 
 
 def shade_picture(
@@ -49,14 +49,14 @@ def shade_picture(
     sunlight: Sunlight,
 ) -> list[Float]:
     """Dimmed colours, and visibility as it is shown. first_layer, packed: see `model._PictureCache`"""
-    launched, mirrored = None, None
+    said, mirrored = None, None
     if first_layer and fused.takes(config.field.shape):
         is_mirroring = bool(sunlight.emitted) and inputs.surroundings is not None
         read, rays = _picture_inputs(config, field_weights, inputs, batch, first_layer.inputs, is_mirroring)
-        launched = _outputs(config.field.shape, field_weights, read, first_layer)
-        if launched is not None and rays and inputs.surroundings:
+        said = _outputs(config.field.shape, field_weights, read, first_layer)
+        if rays and inputs.surroundings and not dr.grad_enabled(rays, sunlight.emitted):
             mirrored = gather_light(inputs.surroundings, sunlight.emitted, config.bounce, rays, MIRRORED)
-    return _shade_picture(config, field_weights, inputs, batch, first_layer, packed, launched, mirrored, sunlight)
+    return _shade_picture(config, field_weights, inputs, batch, first_layer, packed, said, mirrored, sunlight)
 
 
 def _outputs(
@@ -92,15 +92,15 @@ def _shade_picture(
     batch: PaddedBatch,
     first_layer: network.PartialLayer | None,
     packed: cooperative.PackedNetwork | None,
-    launched: TensorXf | None,
+    said: TensorXf | None,
     mirrored: list[Float] | None,
     sunlight: Sunlight,
 ) -> list[Float]:
-    """launched: what the field says, if that is known;  mirrored: light that arrives to be mirrored, if that is"""
+    """said: what the field says, if that is known;  mirrored: light that arrives to be mirrored, if that is"""
     field, field_inputs = config.field, inputs.of_field()
     views = field_views(field, field_inputs, batch)
-    if launched is not None:
-        outputs = [network.row_of(launched, i) for i in range(field.shape.outputs)]
+    if said is not None:
+        outputs = [network.row_of(said, i) for i in range(field.shape.outputs)]
     elif packed is None:
         assert first_layer is not None, "one of the two"
         items = batch.matrix(views, round_up_rows(len(views)))
@@ -128,11 +128,11 @@ def _shade_picture(
 def refined_visibility(config: LightConfig, weights: list[Float], inputs: ShadingInputs, batch: PaddedBatch) -> Float:
     """Of the Sun, refined, [N]."""
     _, refine_weights = split_weights(config, weights)
-    launched = None
+    said = None
     if config.refine and fused.takes(config.refine.shape):
         read = _refine_inputs(config, refine_weights, inputs, batch)
-        launched = _outputs(config.refine.shape, refine_weights, read)
-    return _refined_visibility(config, refine_weights, inputs, batch, launched)
+        said = _outputs(config.refine.shape, refine_weights, read)
+    return _refined_visibility(config, refine_weights, inputs, batch, said)
 
 
 @recorded
@@ -148,15 +148,15 @@ def _refined_visibility(
     refine_weights: list[Float],
     inputs: ShadingInputs,
     batch: PaddedBatch,
-    launched: TensorXf | None,
+    said: TensorXf | None,
 ) -> Float:
-    """launched: what the refinement says, if that is known"""
-    if launched is None or config.refine is None:
+    """said: what the refinement says, if that is known"""
+    if said is None or config.refine is None:
         items = items_of_refinement(config, inputs, batch)
         (occlusion,), _ = occlusion_and_tape(config, refine_weights, inputs, batch, items)
     else:
         (raw,) = raw_occlusion(inputs, batch)
-        occlusion = refine_occlusion(config.refine, raw, network.row_of(launched, 0))
+        occlusion = refine_occlusion(config.refine, raw, network.row_of(said, 0))
     visibility = 1 - occlusion
     dr.eval(visibility)
     return batch.unpad([visibility], inputs.means.x)[0]
@@ -168,12 +168,13 @@ def scatter_sunlight(
     """(light that bounces, what is emitted), see `Sunlight`. visibility: of the Sun, [N] in a list, or nothing for 1"""
     field_weights, _ = split_weights(config, weights)
     surroundings = inputs.surroundings
-    if surroundings is None or not fused.takes(config.field.shape) or dr.grad_enabled(inputs.features, weights):
+    has_gradients = dr.grad_enabled(inputs.features, inputs.means, weights, visibility)
+    if surroundings is None or has_gradients or not fused.takes(config.field.shape):
         return _scatter_sunlight(config, field_weights, inputs, batch, visibility)
-    shape, rays, read = config.field.shape, *_scatter_inputs(config, field_weights, inputs, batch)
-    painted = fused.outputs(shape, field_weights, *read).outputs if read else None
+    rays, read = _scatter_inputs(config, field_weights, inputs, batch)
+    painted = fused.outputs(config.field.shape, field_weights, *read).outputs if read else None
     emitted = _emitted(config, field_weights, inputs, batch, visibility, painted)
-    light = gather_light(surroundings, emitted, config.bounce, rays, SIDES)
+    light = gather_light(surroundings, emitted, config.bounce, rays, BOTH_SIDES)
     return _of_all(inputs, batch, light), emitted if config.mirrors else []
 
 

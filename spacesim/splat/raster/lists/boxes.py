@@ -115,8 +115,8 @@ def each_tile(
 
 
 def divided(number: UInt32, by: Float | UInt32) -> tuple[UInt32, UInt32]:
-    """(quotient, below 2^21, rest) of whole numbers, Floats below 2^24. On LLVM integers would be divided one by
-    one."""
+    """(quotient, rest) of whole numbers: the quotient is below 2^21, a divisor that is a Float below 2^24. On LLVM
+    integers would be divided one by one."""
     quotient, divisor = ad.UInt32((ad.Float(number) + 0.5) / ad.Float(by)), ad.UInt32(by)
     rest = number - quotient * divisor
     quotient = dr.select(rest >= 2**31, quotient - 1, dr.select(rest >= divisor, quotient + 1, quotient))  # rounded
