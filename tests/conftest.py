@@ -66,6 +66,19 @@ def _threads(request) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def kernels_of_text() -> None:
+    """Skips where none run."""
+    from spacesim.backend import select
+    from spacesim.backend.kernels import llvm
+
+    if select() != "llvm":
+        pytest.skip("such kernels are a CPU's")
+    if llvm.dr_library() is None:
+        pytest.skip("Dr.Jit's library is not known here")
+    assert llvm.is_usable()
+
+
 @pytest.fixture(scope="session")
 def spacesim() -> Callable[..., Outcome]:
     """Call a command in this process."""

@@ -7,7 +7,7 @@ import pytest
 from splat.splats import random_splats
 from splat.twin import record
 
-from spacesim.backend import ad, recorded, select
+from spacesim.backend import ad, recorded
 from spacesim.backend.kernels import llvm
 from spacesim.backend.kernels.llvm import LlvmKernel, empty, is_usable
 from spacesim.backend.kernels.llvm_text import Text
@@ -19,16 +19,7 @@ from spacesim.splat.raster.lists import pair_sort, record_copy
 from spacesim.splat.raster.project import Pinhole, project
 from spacesim.splat.train.loss import photometric_llvm
 
-pytestmark = pytest.mark.threads
-
-
-@pytest.fixture(autouse=True)
-def _llvm() -> None:
-    if select() != "llvm":
-        pytest.skip("such kernels are a CPU's")
-    if llvm.dr_library() is None:
-        pytest.skip("Dr.Jit's library is not known here")
-    assert is_usable()
+pytestmark = [pytest.mark.threads, pytest.mark.usefixtures("kernels_of_text")]
 
 
 def numbers(count: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from spacesim.backend.kernels.llvm_text import DECLARED, FIRST, Text
+from spacesim.backend.kernels.llvm_text import DECLARED, FIRST, LANES, Text
 from spacesim.backend.llvm import find_llvm
 from spacesim.backend.readback import copy_functions, dr_library
 from spacesim.backend.recording import one_at_a_time
@@ -91,33 +91,30 @@ def is_usable() -> bool:
 def _runs() -> bool:
     """Whether they run here: tried once in a process."""
     dr = load_drjit()
-    numbers, results = dr.arange(ad.Float, 2 * _SIZE), empty(ad.Float, 2 * _SIZE + 1)
+    numbers, results = dr.arange(ad.Float, 2 * LANES), empty(ad.Float, 2 * LANES + 1)
     try:
-        LlvmKernel(["numbers", "results"], ["end"], ("try", _try))([1], [numbers, results], [_SIZE + 3])
+        LlvmKernel(["numbers", "results"], ["end"], ("try", _try))([1], [numbers, results], [LANES + 3])
     except RuntimeError as reason:  # whatever the libraries say: Dr.Jit computes the same
         log.info("no kernels beside Dr.Jit's, which take longer (%s)", reason)
         return False
-    index = dr.arange(ad.UInt32, 2 * _SIZE)
-    squares = dr.select(index < _SIZE + 3, numbers * numbers + numbers, 0)
+    index = dr.arange(ad.UInt32, 2 * LANES)
+    squares = dr.select(index < LANES + 3, numbers * numbers + numbers, 0)
     found = dr.gather(ad.Float, results, index)
-    is_right = dr.all((found == squares) | ((index >= _SIZE + 3) & (index < 2 * _SIZE)))
-    return bool(is_right) and float(results[2 * _SIZE]) == float(dr.sum(squares)[0])
-
-
-_SIZE = 16  # of the vectors of kernels
+    is_right = dr.all((found == squares) | ((index >= LANES + 3) & (index < 2 * LANES)))
+    return bool(is_right) and float(results[2 * LANES]) == float(dr.sum(squares)[0])
 
 
 def _try(text: Text) -> None:
     """One of each instruction that calls for more than LLVM's core: x^2 + x up to a number, and the sum of these."""
-    total = text.zeros(_SIZE)
-    for start in (text.integer(0), text.integer(_SIZE)):
+    total = text.zeros(LANES)
+    for start in (text.integer(0), text.integer(LANES)):
         text.prefetch("numbers", start)
-        lanes = text.lanes(_SIZE, start, text.number("end"))
+        lanes = text.lanes(LANES, start, text.number("end"))
         values = text.load_lanes("numbers", start, lanes)
         squares = text.fma(values, values, values)
         text.store_lanes("results", start, squares, lanes)
         total = total + squares
-    text.store("results", text.integer(2 * _SIZE), text.sum(total))
+    text.store("results", text.integer(2 * LANES), text.sum(total))
 
 
 def _launch(names: Sequence[str], place: int) -> str:

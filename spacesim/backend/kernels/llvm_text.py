@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 INT, FLOAT = "i64", "float"  #: numbers of kernels; arrays hold 32 bits an entry
+LANES = 16  #: numbers of vectors whose functions are `DECLARED`
 FIRST = 4  #: of the addresses among the parameters, 8 bytes each, behind what launches of `LlvmKernel` use
 
 
@@ -185,15 +186,14 @@ class Text:
         self._addresses[name] = self.value("ptr", f"alloca [{size} x {FLOAT}], align 64")
 
     def transposed(self, rows: Sequence[Value]) -> list[Value]:
-        """As many vectors of float32 as each has entries, a power of two, as a matrix on its side."""
-        size, vectors, distance = len(rows), list(rows), 1
-        while distance < size:
-            first = [lane if not lane & distance else lane - distance + size for lane in range(size)]
-            second = [lane + distance if not lane & distance else lane + size for lane in range(size)]
-            for i in (i for i in range(size) if not i & distance):
-                pair = vectors[i], vectors[i + distance]
-                vectors[i], vectors[i + distance] = self._shuffled(*pair, first), self._shuffled(*pair, second)
-            distance *= 2
+        """Vectors of float32, as many as a power of two, as a matrix on its side; of longer vectors each part that is
+        as long as they are many."""
+        count, size, vectors = len(rows), _size(rows[0].kind), list(rows)
+        first = [part + k // 2 + k % 2 * size for part in range(0, size, count) for k in range(count)]
+        halves = first, [lane + count // 2 for lane in first]  # entries of two vectors by turns
+        for _ in range(count.bit_length() - 1):
+            pairs = zip(vectors[: count // 2], vectors[count // 2 :], strict=True)
+            vectors = [self._shuffled(*pair, lanes) for pair in pairs for lanes in halves]
         return vectors
 
     def _shuffled(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
@@ -234,25 +234,16 @@ class Text:
         return self.value(x.kind, f"call {x.kind} @llvm.sqrt.v{_size(x.kind)}f32({x.kind} {x.name})")
 
     def load_threes(self, array: str, places: Sequence[Value]) -> list[Value]:
-        """The first three of the four numbers from each of sixteen places on, as three vectors."""
+        """The first three of the four numbers from each of `LANES` places on, as three vectors."""
         fours = [self.load_floats(array, place, 4) for place in places]
-        rows = []
-        for i in range(4):  # the numbers of places i, i + 4, i + 8 and i + 12
-            halves = [self._shuffled(fours[i + k], fours[i + k + 4], range(8)) for k in (0, 8)]
-            rows.append(self._shuffled(halves[0], halves[1], range(16)))
+        return self.transposed([self._joined(fours[i::4]) for i in range(4)])[:3]
 
-        def beside(first: Value, second: Value, four: Sequence[int]) -> Value:
-            """Of each four numbers of both these; from 4 on: of the second."""
-            lanes = [base + lane % 4 + 16 * (lane // 4) for base in range(0, 16, 4) for lane in four]
-            return self._shuffled(first, second, lanes)
-
-        xy = [beside(*pair, (0, 4, 1, 5)) for pair in ((rows[0], rows[1]), (rows[2], rows[3]))]
-        zw = [beside(*pair, (2, 6, 3, 7)) for pair in ((rows[0], rows[1]), (rows[2], rows[3]))]
-        return [
-            beside(xy[0], xy[1], (0, 1, 4, 5)),
-            beside(xy[0], xy[1], (2, 3, 6, 7)),
-            beside(zw[0], zw[1], (0, 1, 4, 5)),
-        ]
+    def _joined(self, parts: Sequence[Value]) -> Value:
+        """Vectors of one size, as many as a power of two, one behind the other."""
+        while len(parts) > 1:
+            lanes = range(2 * _size(parts[0].kind))
+            parts = [self._shuffled(parts[i], parts[i + 1], lanes) for i in range(0, len(parts), 2)]
+        return parts[0]
 
     @contextmanager
     def loop(self, start: Value, end: Value, state: Sequence[Value] = (), step: Value | int = 1) -> Iterator["Loop"]:

@@ -51,14 +51,14 @@ def forward(shape: MlpShape, weights: list[Float], items: TensorXf, first: Input
 
 def outputs(
     shape: MlpShape, weights: list[Float], items: TensorXf, first: InputLayer, known: PartialLayer | None = None
-) -> Launched:
-    """All layers, of the items [B, C, m], without hidden ones in the tape. first: the first layer;  known: what it
-    makes of first inputs, where items are the others alone"""
+) -> TensorXf:
+    """[B, outputs, m] of the items [B, C, m], for no way back. first: the first layer;  known: what it makes of first
+    inputs, where items are the others alone"""
     chunks, rows, _ = items.shape
     output = _tensor((chunks, shape.outputs, CHUNK))
     arrays = [items.array, *_layers(shape, weights, first), output.array, *([known.values.array] if known else [])]
     _outputs_kernel(shape, rows, known is not None)([chunks * PER_CHUNK], arrays, [])
-    return Launched(MlpTape([items], first), output)
+    return output
 
 
 def backward(way: WayBack) -> tuple[list[Float], TensorXf]:

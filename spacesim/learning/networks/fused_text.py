@@ -7,10 +7,9 @@ Columns are gone through in panels of 64. What hidden layers say of a panel stan
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from spacesim.backend.kernels.llvm_text import Text, Value
+from spacesim.backend.kernels.llvm_text import LANES, Text, Value
 from spacesim.learning.networks.network import CHUNK, MlpShape
 
-LANES = 16  #: numbers of a vector
 PANEL = 64  #: columns that go through all layers together
 PER_CHUNK = CHUNK // PANEL
 BLOCK, SMALL_BLOCK = (4, 4), (6, 1)  #: rows and vectors that registers sum up at once, of 16 and of fewer numbers
@@ -57,20 +56,20 @@ class FusedText:
         for name in ("hidden0", "hidden1"):
             text.room(name, self.shape.width * PANEL)
         hidden = [(f"hidden{i % 2}", text.integer(0)) for i in range(self.shape.layers - 1)]
-        self._forward(text, rows, hidden, "known" if is_known else None)
+        self._forward(text, rows, hidden, is_known)
 
-    def _forward(self, text: Text, rows: int, hidden: list[tuple[str, Value]], known: str | None = None) -> None:
-        """rows: of the items;  hidden: arrays and places of what hidden layers say"""
+    def _forward(self, text: Text, rows: int, hidden: list[tuple[str, Value]], is_known: bool = False) -> None:
+        """rows: of the items;  hidden: arrays and places of what hidden layers say;  is_known: as in `outputs`"""
         chunk, within = text.index // text.integer(PER_CHUNK), text.index % text.integer(PER_CHUNK) * PANEL
         text.room("panel", rows * PANEL)
         self._take(text, "panel", "items", rows, chunk, within)
         source, columns = ("panel", text.integer(0)), rows
         for i in range(self.shape.layers - 1):
-            start = None if known is None or i > 0 else chunk * (self.shape.width * CHUNK) + within
-            self._layer(text, i, columns, source, (*hidden[i], PANEL), start)
+            known = chunk * (self.shape.width * CHUNK) + within if is_known and i == 0 else None
+            self._layer(text, i, columns, source, (*hidden[i], PANEL), known)
             source, columns = hidden[i], self.shape.width
         last, start = self.shape.layers - 1, chunk * (self.shape.outputs * CHUNK) + within
-        self._layer(text, last, columns, source, ("output", start, CHUNK), start if known and last == 0 else None)
+        self._layer(text, last, columns, source, ("output", start, CHUNK), start if is_known and last == 0 else None)
 
     def _layer(
         self,

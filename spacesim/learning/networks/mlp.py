@@ -19,7 +19,7 @@ from spacesim.learning.networks.network import (
     columns_of,
     product,
     round_up_rows,
-    row_of,
+    rows_of,
 )
 from spacesim.learning.networks.packets import activated, masked
 
@@ -52,7 +52,7 @@ def forward(
     tape = [items]
     if launched is not None:
         if launched.outputs is not None:
-            return [row_of(launched.outputs, i) for i in range(shape.outputs)], launched.tape
+            return rows_of(launched.outputs), launched.tape
         tape, input_layer = [*launched.tape.values], launched.tape.input_layer
     if input_layer is None:
         input_layer = make_input_layer(shape, weights, shared, first_layer.inputs if first_layer else 0)
@@ -75,7 +75,7 @@ def forward(
             value += first_layer.values
         if not is_last:
             tape.append(dr.maximum(value, 0))
-    return [row_of(value, i) for i in range(shape.outputs)], MlpTape(tape, input_layer)
+    return rows_of(value), MlpTape(tape, input_layer)
 
 
 def backward(

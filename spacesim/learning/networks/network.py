@@ -137,6 +137,11 @@ def columns_of(matrix: Float, rows: int, stored: int, row_count: int, count: int
     return dr.gather(ad.Float, matrix, row * stored + column, column < count)
 
 
+def rows_of(matrices: TensorXf) -> list[Float]:
+    """All rows, [B * m] each, of a TensorXf [B, C, m]."""
+    return [row_of(matrices, i) for i in range(matrices.shape[1])]
+
+
 def row_of(matrices: TensorXf, i: int) -> Float:
     """Row i [B * m] of a TensorXf [B, C, m]."""
     count, rows, m = matrices.shape

@@ -10,11 +10,10 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Float
 from spacesim.backend.kernels.llvm import LlvmKernel, empty
-from spacesim.backend.kernels.llvm_text import Text, Value
+from spacesim.backend.kernels.llvm_text import LANES, Text, Value
 from spacesim.splat.light.bounce import Parts, Rays, ray_share, ray_weights
 from spacesim.splat.light.surroundings import Surroundings
 
-LANES = 16  #: rays of a vector
 BLOCK = 64  #: Gaussians of a task
 _AXES = "x", "y", "z"
 

@@ -11,7 +11,6 @@ from scipy.special import sph_harm_y
 from splats import light_of, met_along, srgb_of
 
 from spacesim.backend import ad, select
-from spacesim.backend.kernels.llvm import is_usable
 from spacesim.backend.upload import upload
 from spacesim.data.earth import Earth
 from spacesim.data.errors import InputError, WorkError
@@ -528,10 +527,9 @@ def test_rays_of_a_turn_are_summed_up_one_after_another(monkeypatch):
 
 
 @pytest.mark.threads
+@pytest.mark.usefixtures("kernels_of_text")
 @pytest.mark.parametrize("count", [1, 63, 300])
 def test_light_along_rays_is_the_same_by_a_kernel_of_text(count):
-    if select() != "llvm":
-        pytest.skip("such kernels are a CPU's")
     light, splats = model("gloss"), gaussians(300, model("gloss").config.features)
     around, emitters = light.surroundings(splats), light.config.bounce
     scatterers = bounce.Scatterers(splats.features, light.config.field.features, light.config.albedos, ad.Array3f(SUN))
@@ -557,10 +555,9 @@ def test_light_along_rays_is_the_same_by_a_kernel_of_text(count):
         np.testing.assert_allclose(np.stack([numbers(row)[:count] for row in found]), exact, rtol=2e-5, atol=1e-7)
 
 
+@pytest.mark.usefixtures("kernels_of_text")
 @pytest.mark.parametrize("name", ["relight", "map", "gloss"])
 def test_a_cpu_launches_networks_and_rays(name, monkeypatch):
-    if select() != "llvm" or not is_usable():
-        pytest.skip("such kernels are a CPU's")
     light, launched = model(name), []
     for module, function in (
         *((fused, kernel) for kernel in ("forward", "backward", "outputs")),

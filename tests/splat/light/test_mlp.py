@@ -74,6 +74,16 @@ class Case:
         doubles = [np.float64(weight) for weight in self.weights]
         return twin(self.shape, doubles, *map(np.float64, (self.items, self.shared, self.grad_output)))
 
+    def check(self, output, gradients: list, grad_items) -> None:
+        """Both passes beside float64."""
+        exact, exact_gradients, exact_by_items = self.exact()
+        np.testing.assert_allclose(columns(output, self.count), exact, atol=2e-6)
+        np.testing.assert_allclose(columns(grad_items, self.count)[: self.shape.inputs], exact_by_items, atol=5e-6)
+        assert len(gradients) == len(self.weights)
+        for one, other, weight in zip(gradients, exact_gradients, self.weights, strict=True):
+            assert dr.width(one) == len(weight)
+            np.testing.assert_allclose(numbers(one), other, rtol=1e-4, atol=1e-6 * (100 + self.count))
+
 
 def passes(shape, weights, rows, shared, grad_rows, batch):
     items = batch.matrix([batch.pad_zeros(row) for row in rows], shape.rows)
@@ -96,15 +106,9 @@ def _ways(request, monkeypatch) -> None:
 def test_networks_and_their_adjoint_match_float64(name, count):
     case = Case(SHAPES[name], count)
     output, gradients, grad_items = passes(case.shape, *case.device())
-    exact, exact_gradients, exact_by_items = case.exact()
     assert len(output) == case.shape.outputs
     assert dr.width(output) == case.device()[-1].capacity
-    np.testing.assert_allclose(columns(output, count), exact, atol=2e-6)
-    np.testing.assert_allclose(columns(grad_items, count)[: case.shape.inputs], exact_by_items, atol=5e-6)
-    assert len(gradients) == len(case.weights)
-    for one, other, weight in zip(gradients, exact_gradients, case.weights, strict=True):
-        assert dr.width(one) == len(weight)
-        np.testing.assert_allclose(numbers(one), other, rtol=1e-4, atol=1e-6 * (100 + count))
+    case.check(output, gradients, grad_items)
 
 
 @pytest.mark.usefixtures("_ways")

@@ -79,7 +79,7 @@ def shade(
         if read.refinement and refine:
             made.refinement = forward(refine.shape, of_refinement, *read.refinement)
         if read.painted is not None:
-            made.painted = fused.outputs(shape, of_field, read.painted, read.field[1]).outputs
+            made.painted = fused.outputs(shape, of_field, read.painted, read.field[1])
         if read.rays and inputs.surroundings:
             lit = _in_sunlight(config, weights, inputs, batch, made)
             light = gather_light(inputs.surroundings, lit.emitted, config.bounce, read.rays, _arriving(config))

@@ -65,7 +65,7 @@ def _outputs(
     """By a launch; None where gradients are asked for, which it would not know of."""
     if dr.grad_enabled(read, weights, [known.values] if known else []):
         return None
-    return fused.outputs(shape, weights, *read, known).outputs
+    return fused.outputs(shape, weights, *read, known)
 
 
 @recorded
@@ -100,7 +100,7 @@ def _shade_picture(
     field, field_inputs = config.field, inputs.of_field()
     views = field_views(field, field_inputs, batch)
     if said is not None:
-        outputs = [network.row_of(said, i) for i in range(field.shape.outputs)]
+        outputs = network.rows_of(said)
     elif packed is None:
         assert first_layer is not None, "one of the two"
         items = batch.matrix(views, round_up_rows(len(views)))
@@ -172,7 +172,7 @@ def scatter_sunlight(
     if surroundings is None or has_gradients or not fused.takes(config.field.shape):
         return _scatter_sunlight(config, field_weights, inputs, batch, visibility)
     rays, read = _scatter_inputs(config, field_weights, inputs, batch)
-    painted = fused.outputs(config.field.shape, field_weights, *read).outputs if read else None
+    painted = fused.outputs(config.field.shape, field_weights, *read) if read else None
     emitted = _emitted(config, field_weights, inputs, batch, visibility, painted)
     light = gather_light(surroundings, emitted, config.bounce, rays, BOTH_SIDES)
     return _of_all(inputs, batch, light), emitted if config.mirrors else []

@@ -72,7 +72,7 @@ def emitted_light(
             items = painted_items(config, inputs, batch.count)
             output, _ = mlp.forward(shape, weights, items, inputs.sun.field_encoding, input_layer=input_layer)
         else:
-            output = [network.row_of(painted, i) for i in range(shape.outputs)]
+            output = network.rows_of(painted)
         light = _painted(config, output, shares)
     else:
         light = albedo_radiance(scatterers, shares(dr.arange(ad.UInt32, config.bounce)), emitters, batch.count)

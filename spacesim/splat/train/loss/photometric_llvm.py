@@ -13,10 +13,9 @@ import drjit as dr
 from spacesim.backend import ad
 from spacesim.backend.arrays import Array3f, Float
 from spacesim.backend.kernels.llvm import LlvmKernel, empty
-from spacesim.backend.kernels.llvm_text import Text, Value, float_bits
+from spacesim.backend.kernels.llvm_text import LANES, Text, Value, float_bits
 from spacesim.splat.train.loss.window import RADIUS, blurred, similarity
 
-LANES = 16  #: pixels of a vector
 ROWS, COLUMNS = 32, 16  #: of a block; columns are vectors
 _MOMENT_ROWS, _DERIVATIVE_ROWS = ROWS + 4 * RADIUS, ROWS + 2 * RADIUS  # that a block needs
 # Rows of a task's room, one behind the other: of the pictures and their products; of the moments, blurred along rows,
