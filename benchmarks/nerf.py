@@ -109,13 +109,8 @@ def step_time(data: Dataset, run: NerfRun, repeats: int) -> common.Timing:
 
 
 def step_timing(step: Callable[[], Any], turn: int, repeats: int) -> common.Timing:
-    """Of `step`, called so that the device is never idle between the steps of a turn."""
-
-    def several() -> None:
-        for _ in range(turn):
-            step()
-
-    return common.Timing.of(np.array(common.seconds({"": several}, repeats)[""]) / turn)
+    """Of `step`, so many a turn."""
+    return common.Timing.of(common.in_a_row({"": step}, repeats, turn, common.WARM_UP)[""])
 
 
 def trained_row(step: common.Timing, duration: float, model: Any, data: Dataset) -> common.Row:

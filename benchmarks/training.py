@@ -36,8 +36,6 @@ MEMORY_SIZES = "16384x64,16385x64,20000x64,21846x64,30000x64,32769x64,43691x64,6
 """A power of two; just above one and above 4/3 of one, where a Gaussian takes most; others."""
 SIZES = {"cuda": "31622x1024,101958x1024,165495x1024,1000000x1024", "llvm": "30000x256"}
 ROUNDS = 3  #: of ours and OpenSplat in turn
-WARM_UP = 20  #: steps: all degrees of harmonics are recorded, all pictures decoded
-IN_A_ROW = 20  #: steps that are timed together
 RATES = dict.fromkeys(("means", "log_scales", "quaternions", "logit_opacities", "sh0", "shN"), STILL.means)
 
 
@@ -95,7 +93,7 @@ def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> 
         for name, peer in peers.items():
             steps = peer.steps((arrays, views, RATES, SSIM_WEIGHT))
             works |= {f"{name}, {label}": step for label, step in steps.items()}
-        times = {label: common.Timing.of(seconds) for label, seconds in step_seconds(works, repeats).items()}
+        times = {label: common.Timing.of(seconds) for label, seconds in common.in_a_row(works, repeats).items()}
         kernels = common.kernels(trainer.step)
     if trainer.gaussians.count != count or trainer.iteration >= NEVER:
         raise AssertionError("a step of the benchmark has refined")
@@ -104,23 +102,6 @@ def measure(count: int, pixels: int, repeats: int, peers: Mapping[str, Any]) -> 
     result |= {"kernels": kernels.milliseconds, "launches": kernels.launches}
     result["ratios"] = {k: times["spacesim"].median / t.median for k, t in times.items() if k != "spacesim"}
     return result
-
-
-def step_seconds(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """Of a step of each work, `IN_A_ROW` of them timed together."""
-    rows = {label: in_a_row(step) for label, step in works.items()}
-    seconds = common.seconds(rows, repeats, -(-WARM_UP // IN_A_ROW))
-    return {label: [row / IN_A_ROW for row in some] for label, some in seconds.items()}
-
-
-def in_a_row(step: Callable[[], Any]) -> Callable[[], None]:
-    """So many steps."""
-
-    def steps() -> None:
-        for _ in range(IN_A_ROW):
-            step()
-
-    return steps
 
 
 def describe(result: dict[str, Any]) -> list[common.Row]:
@@ -142,7 +123,7 @@ def beside_opensplat(count: int, pixels: int, repeats: int, binary: Path | None)
         trainer = still_trainer(dataset, count)
         ours, pairs = list[float](), list[tuple[float, float]]()
         for _ in range(ROUNDS):
-            ours += step_seconds({"spacesim": trainer.step}, -(-repeats // ROUNDS))["spacesim"]
+            ours += common.in_a_row({"spacesim": trainer.step}, -(-repeats // ROUNDS))["spacesim"]
             if binary is not None:
                 pairs.append(peer_opensplat.run_pair(binary, dataset))
     row: common.Row = {"Gaussians": count, "pixels": pixels, "spacesim": common.Timing.of(ours)}

@@ -8,7 +8,8 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from spacesim.splat.train.config import TrainConfig
 
 WARM_UP = 5  #: calls that do not count
+IN_A_ROW = 20  #: steps that are timed together
+QUIET = 1.2  #: times what the quickest processor takes, up to which one is quiet
 PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim", "FasterGSCudaBackend")
 FIELD_OF_VIEW = 35  #: degrees
 CURVES = "#5a6472", "#b9560f", "#2a66ad", "#3d7a3a"  #: colours of a chart that stands alone
@@ -233,9 +236,73 @@ def seconds(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> 
     return {name: values[warm_up:] for name, values in durations.items()}
 
 
+def in_a_row(works: Mapping[str, Work], repeats: int, turn: int = IN_A_ROW, warm_up: int = 1) -> dict[str, list[float]]:
+    """Seconds of a call of each work, `turn` of them timed together, as in training, where the device need not wait for
+    the host between two; by `on_quiet_processors`. warm_up: turns"""
+
+    def several(work: Work) -> Work:
+        def calls() -> None:
+            for _ in range(turn):
+                work()
+
+        return calls
+
+    with on_quiet_processors():
+        timed = seconds({name: several(work) for name, work in works.items()}, repeats, warm_up)
+    return {name: [of_turn / turn for of_turn in values] for name, values in timed.items()}
+
+
+def quiet_processors() -> set[int]:
+    """Of this process's, those that take no longer than `QUIET` times as long for some Python as the quickest: where
+    another guest of the host keeps the other thread of a core busy, ours takes up to twice as long (Linux)."""
+    mine = os.sched_getaffinity(0)
+    try:
+        taken = {one: _probe(one) for one in sorted(mine)}
+    finally:
+        os.sched_setaffinity(0, mine)
+    return {one for one, seconds in taken.items() if seconds <= QUIET * min(taken.values())}
+
+
+def _probe(processor: int) -> float:
+    """Seconds of some Python there, the least of three."""
+    os.sched_setaffinity(0, {processor})
+    taken = []
+    for _ in range(3):
+        start = time.perf_counter()
+        sum(number * number for number in range(10_000))
+        taken.append(time.perf_counter() - start)
+    return min(taken)
+
+
+@contextmanager
+def on_quiet_processors() -> Iterator[None]:
+    """All threads of this process on `quiet_processors` meanwhile, where the system lets them be put there, and a GPU
+    computes."""
+    if backend.select() != "cuda" or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    mine, quiet = os.sched_getaffinity(0), quiet_processors()
+    _quiet.append(f"{len(quiet)} of {len(mine)}")
+    _put_threads(quiet)
+    try:
+        yield
+    finally:
+        _put_threads(mine)
+
+
+def _put_threads(processors: set[int]) -> None:
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(OSError):  # it has ended
+            os.sched_setaffinity(int(thread.name), processors)
+
+
+_quiet: list[str] = []  # how many processors were, at each measurement
+
+
 def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
-    """The same as timings."""
-    return {name: Timing.of(values) for name, values in seconds(works, repeats, warm_up).items()}
+    """The same as timings, by `on_quiet_processors`."""
+    with on_quiet_processors():
+        return {name: Timing.of(values) for name, values in seconds(works, repeats, warm_up).items()}
 
 
 @dataclass(frozen=True)
@@ -292,6 +359,8 @@ def machine() -> dict[str, str]:
     had, stolen = (now - then for now, then in zip(_processors(), before, strict=True))
     facts["load before"] = f"{load:.2f} of {os.cpu_count()} processors"
     facts["taken by other guests"] = f"{100 * stolen / max(had, 1e-9):.1f} %"
+    if _quiet:
+        facts["quiet processors"] = ", ".join(dict.fromkeys(_quiet))
     if name == "cuda":
         facts["cuda"] = ".".join(map(str, dr.detail.cuda_version()))
     else:
