@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from spacesim.splat.train.config import TrainConfig
 
 WARM_UP = 5  #: calls that do not count
+WARM = 0.3  #: seconds until a GPU's clock has risen, and the host has seen each way through the code
+ROUNDS = 3  #: of a measurement: which processors are quiet changes
 IN_A_ROW = 20  #: steps that are timed together
-QUIET = 1.2  #: times what the quickest processor takes, up to which one is quiet
+QUIET = 1.1  #: times what the quickest processor takes, up to which one is quiet
 PACKAGES = ("spacesim", "drjit", "mitsuba", "numpy", "torch", "gsplat", "fused_ssim", "FasterGSCudaBackend")
 FIELD_OF_VIEW = 35  #: degrees
 CURVES = "#5a6472", "#b9560f", "#2a66ad", "#3d7a3a"  #: colours of a chart that stands alone
@@ -224,21 +226,36 @@ def synchronise() -> None:
 
 
 def seconds(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, list[float]]:
-    """Of each work, device synchronised before and after; they take turns, so that all see the same machine."""
+    """Of each work, device synchronised before and after; they take turns, so that all see the same machine. warm_up:
+    turns that do not count, and more until `WARM` seconds are over; 0: none"""
     durations: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(warm_up + repeats):
+    begun, turns, cold = time.perf_counter(), 0, warm_up
+    while turns < cold + repeats:
         for name, work in works.items():
             synchronise()
             start = time.perf_counter()
             work()
             synchronise()
             durations[name].append(time.perf_counter() - start)
-    return {name: values[warm_up:] for name, values in durations.items()}
+        turns += 1
+        if 0 < warm_up <= turns == cold and time.perf_counter() - begun < WARM:
+            cold += 1
+    return {name: values[cold:] for name, values in durations.items()}
+
+
+def on_quiet_host(works: Mapping[str, Work], repeats: int, warm_up: int) -> dict[str, list[float]]:
+    """`seconds` in `ROUNDS`, each by the processors that are quiet then (`on_quiet_processors`)."""
+    durations: dict[str, list[float]] = {name: [] for name in works}
+    for part in range(ROUNDS):
+        with on_quiet_processors():
+            for name, values in seconds(works, -(-repeats // ROUNDS), 1 if part else warm_up).items():
+                durations[name] += values
+    return durations
 
 
 def in_a_row(works: Mapping[str, Work], repeats: int, turn: int = IN_A_ROW, warm_up: int = 1) -> dict[str, list[float]]:
     """Seconds of a call of each work, `turn` of them timed together, as in training, where the device need not wait for
-    the host between two; by `on_quiet_processors`. warm_up: turns"""
+    the host between two, `on_quiet_host`. warm_up: turns"""
 
     def several(work: Work) -> Work:
         def calls() -> None:
@@ -247,8 +264,7 @@ def in_a_row(works: Mapping[str, Work], repeats: int, turn: int = IN_A_ROW, warm
 
         return calls
 
-    with on_quiet_processors():
-        timed = seconds({name: several(work) for name, work in works.items()}, repeats, warm_up)
+    timed = on_quiet_host({name: several(work) for name, work in works.items()}, repeats, warm_up)
     return {name: [of_turn / turn for of_turn in values] for name, values in timed.items()}
 
 
@@ -264,14 +280,11 @@ def quiet_processors() -> set[int]:
 
 
 def _probe(processor: int) -> float:
-    """Seconds of some Python there, the least of three."""
+    """Seconds of some Python there."""
     os.sched_setaffinity(0, {processor})
-    taken = []
-    for _ in range(3):
-        start = time.perf_counter()
-        sum(number * number for number in range(10_000))
-        taken.append(time.perf_counter() - start)
-    return min(taken)
+    start = time.perf_counter()
+    sum(number * number for number in range(50_000))
+    return time.perf_counter() - start
 
 
 @contextmanager
@@ -300,9 +313,8 @@ _quiet: list[str] = []  # how many processors were, at each measurement
 
 
 def interleaved(works: Mapping[str, Work], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
-    """The same as timings, by `on_quiet_processors`."""
-    with on_quiet_processors():
-        return {name: Timing.of(values) for name, values in seconds(works, repeats, warm_up).items()}
+    """The same as timings, `on_quiet_host`."""
+    return {name: Timing.of(values) for name, values in on_quiet_host(works, repeats, warm_up).items()}
 
 
 @dataclass(frozen=True)
