@@ -81,13 +81,6 @@ def blend_lists(
     return _blend_splats(splats, features, lists, size, capacity, bucket)
 
 
-def blend_packed(
-    packed: list[Float], channels: int, lists: TileLists, width: int, height: int, capacity: int
-) -> BlendResult:
-    """`blend_lists` of what is packed already, with `channels` features."""
-    return _blend_records(list_records(packed, lists, capacity), channels, lists, (width, height), capacity, None)
-
-
 _packed = recorded(pack_records)
 
 

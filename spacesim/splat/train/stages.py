@@ -95,25 +95,21 @@ def list_view(
 
 
 @dataclass
-class ListedView:
-    """A view's splats in lists, to be blended."""
-
-    splats: Splats  #: on the screen
-    lists: TileLists  #: which splats each tile has
-    values: list[Float]  #: what is blended, [N] each
-
-    def blend(self, size: tuple[int, int]) -> "BlendTape":
-        """Width and height, pixels."""
-        return BlendTape(self.splats, self.lists, forward(self.splats, self.values, self.lists, *size, adjoint=True))
-
-
-@dataclass
 class BlendTape:
     """What blending a view leaves behind for its way back."""
 
     splats: Splats  #: what was blended
     lists: TileLists  #: which splats each tile has
     blended: BlendResult  #: what `forward` leaves behind
+
+
+def blend_view(
+    splats: Splats, values: dict[str, list[Float]], lists: TileLists, camera: Pinhole
+) -> tuple[BlendTape, dict[str, int]]:
+    """Blend what `find_view_boxes` and a view's light give. Also how many planes each name has."""
+    planes = [value for group in values.values() for value in group]
+    blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
+    return BlendTape(splats, lists, blended), {name: len(group) for name, group in values.items()}
 
 
 @dataclass
@@ -129,20 +125,7 @@ class DrawnView:
 def draw_view(view: ViewRequest, limit: UInt32, capacities: Capacities, grid: Grid) -> DrawnView:
     """`list_view`, and what it lists blended."""
     splats, values, radii, lists, pair_ends = list_view(view, limit, capacities, grid)
-    planes, channels = in_order(values)
-    tape = ListedView(splats, lists, planes).blend((view.camera.width, view.camera.height))
-    return DrawnView(radii, pair_ends, tape, channels)
-
-
-def in_order(values: dict[str, list[Float]]) -> tuple[list[Float], dict[str, int]]:
-    """Values one after another; how many each name has."""
-    return [value for group in values.values() for value in group], {name: len(group) for name, group in values.items()}
-
-
-def by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:
-    """The inverse of `in_order`."""
-    rest = iter(values)
-    return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
+    return DrawnView(radii, pair_ends, *blend_view(splats, values, lists, view.camera))
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:
