@@ -9,6 +9,7 @@ an H200 for 0.1 to 0.4 ms. Numbers that each step or picture has anew come throu
 
 import ctypes
 import threading
+from array import array as floats
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -22,6 +23,7 @@ from spacesim.backend.selection import ad, select
 
 VECTOR = 64  # elements of the widest vector, and more
 MAX_NUMBERS = 128  #: of a list that `_Outbox` sends
+SLOT = 4 * MAX_NUMBERS  #: bytes of a list's memory
 LISTS = 256  #: that it sends from half of its memory
 
 
@@ -56,7 +58,7 @@ class _Outbox:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._halves: list[tuple[HostSlot, np.ndarray]] = []
+        self._halves: list[tuple[HostSlot, memoryview]] = []  # and bytes of its memory
         self._sent = 0
 
     def send(self, values: Sequence[float], functions: dict[str, Any]) -> Float:
@@ -68,25 +70,23 @@ class _Outbox:
         array = dr.empty(ad.Float, len(values))
         dr.make_opaque(array)
         if not self._halves:
-            kind, size = dr.backend_v(array).value, 4 * MAX_NUMBERS * LISTS
+            kind, size = dr.backend_v(array).value, SLOT * LISTS
             self._halves = [_locked(functions["allocate"](kind, size, LOCKED)) for _ in range(2)]
         turn, place = divmod(self._sent, LISTS)
         slot, memory = self._halves[turn % 2]
         if place == 0 and turn >= 2:
             slot.event.wait()
-        first = MAX_NUMBERS * place
-        with np.errstate(over="ignore"):  # infinite, as elsewhere
-            memory[first : first + len(values)] = values
-        copy_entries(array, 0, len(values), slot.address + 4 * first, functions, to_device=True)
+        numbers, first = floats("f", values), SLOT * place
+        memory[first : first + numbers.itemsize * len(numbers)] = numbers.tobytes()
+        copy_entries(array, 0, len(numbers), slot.address + first, functions, to_device=True)
         self._sent += 1
         if place == LISTS - 1:
             slot.record(functions)
         return array
 
 
-def _locked(address: int) -> tuple[HostSlot, np.ndarray]:
-    memory: Any = (ctypes.c_float * (MAX_NUMBERS * LISTS)).from_address(address)
-    return HostSlot(address), np.frombuffer(memory, np.float32)
+def _locked(address: int) -> tuple[HostSlot, memoryview]:
+    return HostSlot(address), memoryview((ctypes.c_char * (SLOT * LISTS)).from_address(address)).cast("B")
 
 
 _outbox = _Outbox()

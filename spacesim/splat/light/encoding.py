@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Literal
 
 import drjit as dr
@@ -48,10 +47,4 @@ class Encoding:
     def of_one(self, vector: Sequence[float] | Array) -> Float:
         """Float [size] of one vector, three numbers, by the host. They are no constants of a kernel: others compile
         nothing."""
-        return upload_numbers(_numbers_of_one(self, *(float(number) for number in vector)))
-
-
-@lru_cache(maxsize=2)
-def _numbers_of_one(encoding: Encoding, x: float, y: float, z: float) -> list[float]:
-    """Kept for the next who asks: field and refinement often encode the Sun alike, one after the other."""
-    return [float(term) for term in encoding(dr.scalar.Array3f64([x, y, z]))]
+        return upload_numbers([float(term) for term in self(dr.scalar.Array3f64([float(number) for number in vector]))])

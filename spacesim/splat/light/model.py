@@ -355,7 +355,10 @@ class LightModel:
     @staticmethod
     def _with_embedding(terms: SunEncoding, embedding: list[Float]) -> SunEncoding:
         """`encode_sun` with an embedding in a list, or nothing."""
-        return replace(terms, field_encoding=dr.concat([terms.field_encoding, *embedding])) if embedding else terms
+        if not embedding:
+            return terms
+        with_embedding = dr.concat([terms.field_encoding, *embedding])
+        return replace(terms, field_encoding=with_embedding, refine_encoding=[terms.of_refinement])
 
     def _embedding(self, picture: int) -> list[Float]:
         """Float [E] of a training picture in a list, or nothing."""
@@ -418,15 +421,14 @@ class LightModel:
         return cache
 
     def _encode_sun(self, earth: Earth | None, *sun: float) -> SunEncoding:
-        refine = self.config.refine or self.config.field
+        field, refine = self.config.field, self.config.refine
         beams, eclipse = [], []
         if earth and earth.albedo > 0 and self.config.earth:
             beams = [upload(earth.beams(np.array(sun)))]
         if earth and (share := earth.visible_sun(np.array(sun))) < 1:
             eclipse = [upload(eclipse_numbers(share, self.config.linear))]
-        terms = SunEncoding(light_rows(sun), self.config.field.sun.of_one(sun), refine.sun.of_one(sun), beams, eclipse)
-        dr.eval(terms)
-        return terms
+        of_refinement = [refine.sun.of_one(sun)] if refine and refine.sun != field.sun else []
+        return SunEncoding(light_rows(sun), field.sun.of_one(sun), of_refinement, beams, eclipse)
 
 
 def _features(gaussians: Gaussians) -> Float:

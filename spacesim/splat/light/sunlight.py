@@ -15,9 +15,14 @@ class SunEncoding:
 
     light_axes: Float  #: [9], `light_rows`
     field_encoding: Float  #: input of the field's network: the Sun's encoding, then the picture's embedding
-    refine_encoding: Float  #: input of the refinement's network
+    refine_encoding: list[Float]  #: input of the refinement's network in a list, or nothing where it is the field's
     beams: list[Float]  #: the Earth's, Float [4 * BEAMS] of `Earth.beams` in a list, or nothing
     eclipse: list[Float]  #: where the Earth hides some of the Sun, Float [2] of `eclipse_numbers` in a list, or nothing
+
+    @property
+    def of_refinement(self) -> Float:
+        """Input of the refinement's network."""
+        return (self.refine_encoding or [self.field_encoding])[0]
 
     def left(self, light: list[Float]) -> list[Float]:
         """What the Earth leaves of sunlight [M]."""

@@ -48,16 +48,18 @@ Finish = Callable[[Float, list[Float]], list[Float]]
 def forward(
     splats: Splats, features: list[Float], lists: TileLists, width: int, height: int, adjoint: bool = False
 ) -> BlendResult:
-    """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs.
+    """Blend `features` (C arrays [N]) over the pixels of a width x height image. Detached inputs. No part of a
+    recording, which would keep N rounded up: that is `blend_lists`.
 
     adjoint: keep what `backward` reads; it costs memory
     """
-    bucket = _bucket(lists, len(features)) if adjoint else None
+    assert not dr.flag(dr.JitFlag.FreezingScope), "a recording would keep the capacity"
+    bucket = bucket_pairs(lists, len(features)) if adjoint else None
     return blend_lists(splats, features, lists, width, height, round_capacity(dr.width(splats.x)), bucket)
 
 
-def _bucket(lists: TileLists, channels: int) -> int:
-    """Pairs of a bucket; 0 for the adjoint by tiles."""
+def bucket_pairs(lists: TileLists, channels: int) -> int:
+    """Pairs of a bucket of the adjoint; 0 for that by tiles."""
     pixels = lists.shape.width * lists.shape.height
     needed = 16 * -(-(1 + channels) // 4) * pixels * count_pieces(lists, BUCKET)
     return BUCKET if select() == "cuda" and lists.capacity > 0 and needed <= CHECKPOINT_BYTES else 0
@@ -72,13 +74,20 @@ def blend_lists(
     capacity: int,
     bucket: int | None = None,
 ) -> BlendResult:
-    """`forward`, which may be a part of recordings. capacity: length of the splats' arrays;  bucket: pairs of a bucket
-    of the adjoint, 0 for that by tiles, None where there is none"""
+    """`forward`, which may be a part of recordings. capacity: length of the splats' arrays;  bucket: `bucket_pairs`,
+    None where there is no adjoint"""
     size = width, height
     if is_usable() and lists.capacity > 0:  # records are copied between two recordings
         records = list_records(_packed(splats, features, capacity), lists, capacity)
         return _blend_records(records, len(features), lists, size, capacity, bucket)
     return _blend_splats(splats, features, lists, size, capacity, bucket)
+
+
+def blend_packed(
+    packed: list[Float], channels: int, lists: TileLists, width: int, height: int, capacity: int
+) -> BlendResult:
+    """`blend_lists` of what is packed already, with `channels` features."""
+    return _blend_records(list_records(packed, lists, capacity), channels, lists, (width, height), capacity, None)
 
 
 _packed = recorded(pack_records)

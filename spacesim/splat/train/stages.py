@@ -11,7 +11,7 @@ from spacesim.backend.packet import numbers_at
 from spacesim.data.images.tone import PEAK
 from spacesim.learning.adam import adam_step
 from spacesim.learning.networks.joined import Joined
-from spacesim.splat.raster.blend import forward
+from spacesim.splat.raster.blend import blend_lists, bucket_pairs
 from spacesim.splat.raster.cameras import MAX_MAGNITUDE, Pinhole
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import make_boxes, make_lists
@@ -95,21 +95,28 @@ def list_view(
 
 
 @dataclass
+class ListedView:
+    """A view's splats in lists, to be blended."""
+
+    splats: Splats  #: on the screen
+    lists: TileLists  #: which splats each tile has
+    values: list[Float]  #: what is blended, [N] each
+    capacity: int  #: `round_capacity` of N: a recording that took it from an array would keep it for every N
+
+    def blend(self, size: tuple[int, int]) -> "BlendTape":
+        """Width and height, pixels."""
+        bucket = bucket_pairs(self.lists, len(self.values))
+        blended = blend_lists(self.splats, self.values, self.lists, *size, self.capacity, bucket)
+        return BlendTape(self.splats, self.lists, blended)
+
+
+@dataclass
 class BlendTape:
     """What blending a view leaves behind for its way back."""
 
     splats: Splats  #: what was blended
     lists: TileLists  #: which splats each tile has
-    blended: BlendResult  #: what `forward` leaves behind
-
-
-def blend_view(
-    splats: Splats, values: dict[str, list[Float]], lists: TileLists, camera: Pinhole
-) -> tuple[BlendTape, dict[str, int]]:
-    """Blend what `find_view_boxes` and a view's light give. Also how many planes each name has."""
-    planes = [value for group in values.values() for value in group]
-    blended = forward(splats, planes, lists, camera.width, camera.height, adjoint=True)
-    return BlendTape(splats, lists, blended), {name: len(group) for name, group in values.items()}
+    blended: BlendResult  #: of the splats
 
 
 @dataclass
@@ -125,7 +132,20 @@ class DrawnView:
 def draw_view(view: ViewRequest, limit: UInt32, capacities: Capacities, grid: Grid) -> DrawnView:
     """`list_view`, and what it lists blended."""
     splats, values, radii, lists, pair_ends = list_view(view, limit, capacities, grid)
-    return DrawnView(radii, pair_ends, *blend_view(splats, values, lists, view.camera))
+    planes, channels = in_order(values)
+    tape = ListedView(splats, lists, planes, capacities.splats).blend((view.camera.width, view.camera.height))
+    return DrawnView(radii, pair_ends, tape, channels)
+
+
+def in_order(values: dict[str, list[Float]]) -> tuple[list[Float], dict[str, int]]:
+    """Values one after another; how many each name has."""
+    return [value for group in values.values() for value in group], {name: len(group) for name, group in values.items()}
+
+
+def by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:
+    """The inverse of `in_order`."""
+    rest = iter(values)
+    return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}
 
 
 def screen_radii(gaussians: Gaussians, splats: Splats, camera: Pinhole) -> Float:

@@ -212,8 +212,7 @@ class Trainer(TrainingLoop):
         """Of a view: what was drawn, its loss, gradients by its splats, what it teaches. Changes nothing."""
         view_pass, downscale = self._view_pass, self.config.downscale(self.iteration)
         drawn = view_pass.forward(self.gaussians, rows, self.light, view, degree, downscale, watched)
-        loss = view_pass.loss(drawn, target, view.camera)
-        grad_splats = view_pass.backward(drawn, loss, absolute=watched)
+        loss, grad_splats = view_pass.backward(drawn, target, view.camera, absolute=watched)
         return drawn, loss, grad_splats, view_pass.to_gradients(drawn, loss, grad_splats, self.light)
 
     def _warming(self, index: int) -> bool:

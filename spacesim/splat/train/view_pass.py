@@ -2,7 +2,8 @@
 
 All is recorded and replayed without tracing, lists and what reads them once for each capacity. Where the number of
 pairs is expected, a view is projected and listed in one recording, and blended in it where that needs no light; where
-it is not, the host waits between two. On a CPU kernels of text stand between them.
+it is not, the host waits between two. Another recording blends what light has shown, compares, and goes back. On a CPU
+kernels of text stand between more of them.
 """
 
 from dataclasses import dataclass, field, replace
@@ -33,14 +34,16 @@ from spacesim.splat.train.loss.photometric_llvm import loss_and_gradient
 from spacesim.splat.train.optimizer.update import ViewGradients
 from spacesim.splat.train.stages import (
     BlendTape,
+    ListedView,
     LossSettings,
     TargetImage,
     ViewRequest,
     ViewSplats,
-    blend_view,
+    by_name,
     compared_pictures,
     draw_view,
     find_view_boxes,
+    in_order,
     list_view,
     picture_loss,
 )
@@ -61,26 +64,24 @@ class RenderedView:
     radii: Float | None  #: of `screen_radii`, or None where densification does not watch
     channels: dict[str, int]  #: how many planes each name has
     shading: Shading | None  #: its light, of a method of light
-    tape: BlendTape | None  #: until the way back has read it
+    tape: ListedView | BlendTape | None  #: until the way back has read it; listed where light comes in between
 
     def group(self, values: list[Float], name: str) -> list[Float]:
         """Of what was blended, or its gradients, what has that name."""
-        return _group_by_name(values, self.channels).get(name, [])
+        return by_name(values, self.channels).get(name, [])
 
-    def take_tape(self) -> BlendTape:
-        """What blending left behind, which is not held any longer: memory is shortest here."""
+    def take_tape(self) -> ListedView | BlendTape:
+        """What the way back reads, which is not held any longer: memory is shortest here."""
         assert self.tape is not None, "a view goes back once"
         tape, self.tape = self.tape, None
         return tape
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass
 class ViewLoss:
-    """The loss of a view, and its gradients."""
+    """The loss of a view."""
 
     value: Float  #: of width 1
-    grad_planes: list[Float]  #: gradients by the blended planes, in their order
-    grad_transmittance: Float  #: plane
     grad_gains: Float | None = None  #: [3] by the target's gains, if it has some
 
 
@@ -133,6 +134,7 @@ class ViewPass:
         self._find_boxes, self._list = recorded(find_view_boxes), recorded(list_view)
         self._draw = recorded(draw_view, elements=_elements)
         self._pictures, self._loss = recorded(compared_pictures), recorded(picture_loss)
+        self._compare_at_once = recorded(self._compare, elements=_elements_of_picture)
         self._camera_numbers = lru_cache(KEPT)(partial(_camera_numbers, config.supersample))
         self._hidden = _hidden_weight(config)
         self._screen_sizes: dict[tuple[int, int, int], Float] = {}  # by width, height, number of the view in its step
@@ -185,8 +187,9 @@ class ViewPass:
                 values["visibility"] = [shading.visibility]
         if drawn is not None:  # after shading, which needs memory of its own, where it does not need the lists
             lists, drawn = _lists_of(drawn, extent, pairs), None
-        tape, channels = blend_view(splats, values, lists, camera)
-        return RenderedView(camera, downscale, radii, channels, shading, tape)
+        planes, channels = in_order(values)
+        listed = ListedView(splats, lists, planes, extent.most)
+        return RenderedView(camera, downscale, radii, channels, shading, listed)
 
     def _camera(self, camera: Camera, downscale: int) -> Pinhole:
         """With as many pixels as are blended of a view. A new array each time: two views of a step may be one, and no
@@ -194,29 +197,50 @@ class ViewPass:
         numbers, width, height = self._camera_numbers(camera, downscale)
         return Pinhole(upload_numbers(numbers), width, height)
 
-    def loss(self, drawn: RenderedView, target: TargetImage, camera: Camera) -> ViewLoss:
-        """Compare a view that was drawn. camera: of the target"""
-        assert drawn.tape is not None, "a view is compared before it goes back"
-        blended = drawn.tape.blended
-        planes, size = _group_by_name(blended.features, drawn.channels), (camera.width, camera.height)
+    def backward(
+        self, drawn: RenderedView, target: TargetImage, camera: Camera, absolute: bool
+    ) -> tuple[ViewLoss, SplatGradients]:
+        """Loss of a view, and its gradients by splats and by what was blended. camera: of the target;  absolute: also
+        what `watched` reads"""
+        compare = self._compare if is_usable() else self._compare_at_once  # kernels of text stand between recordings
+        blended, size = (drawn.camera.width, drawn.camera.height), (camera.width, camera.height)
         terms = self._loss_settings[drawn.downscale]
-        shown = planes, blended.transmittance, target, size, terms
-        known = None
+        return compare(drawn.take_tape(), drawn.channels, blended, target, size, terms, absolute)
+
+    def _compare(
+        self,
+        view: ListedView | BlendTape,
+        channels: dict[str, int],
+        blended_size: tuple[int, int],
+        target: TargetImage,
+        size: tuple[int, int],
+        terms: LossSettings,
+        absolute: bool,
+    ) -> tuple[ViewLoss, SplatGradients]:
+        """See `backward`. channels: how many planes each name has;  sizes: pixels that are blended, and the target's"""
+        tape = view.blend(blended_size) if isinstance(view, ListedView) else view
+        planes, transmittance = by_name(tape.blended.features, channels), tape.blended.transmittance
+        value, grad_planes, grad_transmittance = self._picture_loss(planes, transmittance, target, size, terms)
+        (grad_gains,) = grad_planes.pop("gains", [None])
+        by_planes = in_order(grad_planes)[0], grad_transmittance
+        gradients = backward(tape.splats, tape.blended, tape.lists, blended_size, *by_planes, absolute)
+        return ViewLoss(value, grad_gains), gradients
+
+    def _picture_loss(
+        self,
+        planes: dict[str, list[Float]],
+        transmittance: Float,
+        target: TargetImage,
+        size: tuple[int, int],
+        terms: LossSettings,
+    ) -> tuple[Float, dict[str, list[Float]], Float]:
+        """`picture_loss`, its photometric term by kernels of text where they can be launched."""
+        shown, known = (planes, transmittance, target, size, terms), None
         if terms.ssim > 0 and is_usable():
             picture, truth = self._pictures(*shown)
             width, height = (extent // terms.downscale for extent in size)
             known = loss_and_gradient(picture, truth, width, height, terms.ssim)
-        value, grad_planes, grad_transmittance = self._loss(*shown, known)
-        grad_gains = grad_planes.pop("gains", [None])[0]
-        in_order = [plane for group in grad_planes.values() for plane in group]
-        return ViewLoss(value, in_order, grad_transmittance, grad_gains)
-
-    def backward(self, drawn: RenderedView, loss: ViewLoss, absolute: bool) -> SplatGradients:
-        """Gradients of the loss by splats and by what was blended. absolute: also what `watched` reads"""
-        tape, size = drawn.take_tape(), (drawn.camera.width, drawn.camera.height)
-        return backward(
-            tape.splats, tape.blended, tape.lists, size, loss.grad_planes, loss.grad_transmittance, absolute=absolute
-        )
+        return self._loss(*shown, known)
 
     def watched(self, drawn: RenderedView, grad_splats: SplatGradients, place: int) -> OnScreen:
         """What densification watches of a view. place: its number in the step"""
@@ -235,7 +259,7 @@ class ViewPass:
         self, drawn: RenderedView, loss: ViewLoss, grad_splats: SplatGradients, light: LightModel | None
     ) -> ViewResult:
         """What the view teaches, back through its light."""
-        grad_values = _group_by_name(grad_splats.features, drawn.channels)
+        grad_values = by_name(grad_splats.features, drawn.channels)
         if drawn.shading is None or light is None:
             return ViewResult(ViewGradients(drawn.camera, grad_splats.splats, grad_values), loss.value)
         grad_visibility = grad_values.pop("visibility", [None])[0]
@@ -266,12 +290,11 @@ def _elements(arrays: list[Float], view: ViewRequest, *_: object) -> int:
     return min(dr.width(arrays[0]), view.camera.width * view.camera.height)
 
 
+def _elements_of_picture(arrays: list[Float], _view: object, _counts: object, size: tuple[int, int], *_: object) -> int:
+    """The same, of `ViewPass._compare`."""
+    return min(dr.width(arrays[0]), size[0] * size[1])
+
+
 def _camera_numbers(supersample: int, camera: Camera, downscale: int) -> tuple[list[float], int, int]:
     blended = upsampled_camera(camera.downscaled(downscale), supersample)
     return pinhole_numbers(blended), blended.width, blended.height
-
-
-def _group_by_name(values: list[Float], counts: dict[str, int]) -> dict[str, list[Float]]:
-    """So many of the values, one after another, under each name."""
-    rest = iter(values)
-    return {name: [next(rest) for _ in range(count)] for name, count in counts.items()}

@@ -60,7 +60,8 @@ def level(trainer: Trainer, picture: int) -> float:
     drawn = trainer._view_pass.forward(
         trainer.gaussians, rows, trainer.light, view, degree=0, downscale=1, watched=False
     )
-    return float(np.mean([np.array(plane) for plane in drawn.tape.blended.features]))
+    blended = drawn.tape.blend((drawn.camera.width, drawn.camera.height)).blended
+    return float(np.mean([np.array(plane) for plane in blended.features]))
 
 
 def test_a_view_under_several_lights_is_fitted_by_embeddings_alone(one_view):

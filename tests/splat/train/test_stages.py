@@ -5,13 +5,18 @@ from types import SimpleNamespace
 import drjit as dr
 import numpy as np
 import pytest
+from splats import take_cudas
 
 from spacesim.backend import ad
+from spacesim.backend.recording import recordings
+from spacesim.backend.upload import upload
 from spacesim.data.records import Camera
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.project import Pinhole, project
+from spacesim.splat.train import view_pass
+from spacesim.splat.train.async_lists import TrainingPairs
 from spacesim.splat.train.config import preset
-from spacesim.splat.train.stages import screen_radii
+from spacesim.splat.train.stages import TargetImage, screen_radii
 from spacesim.splat.train.view_pass import ViewPass
 from spacesim.splat.train.views import TrainingView
 
@@ -79,3 +84,34 @@ def test_gaussians_too_faint_to_draw_count_as_seen():
     assert (
         view_pass.forward(gaussians, gaussians.rows(), None, view, degree=0, downscale=1, watched=False).radii is None
     )
+
+
+def test_recordings_serve_any_number_of_gaussians(monkeypatch):
+    """As they are on CUDA: Gaussians come and go, and lists of one capacity may be of more than arrays had room for."""
+    take_cudas(monkeypatch)
+    monkeypatch.setattr(view_pass, "is_usable", lambda: False)
+    rgba = np.full(SIZE * SIZE, 0xFF4080C0, np.uint32)
+    view = TrainingView(0, camera(), None, rgba, None, False, {})
+    target = TargetImage(upload(rgba, ad.UInt32), ad.Float([0.1, 0.2, 0.3]), ad.Bool(True), {})
+    rng, trained, capacities, made = np.random.default_rng(0), ViewPass(preset("fast"), scale=1.0), set(), []
+    trained.pairs = TrainingPairs(())
+
+    def gradients(gaussians, compare) -> list[np.ndarray]:
+        drawn = trained.forward(gaussians, gaussians.rows(), None, view, degree=0, downscale=1, watched=True)
+        capacities.add(drawn.tape.lists.capacity)
+        before, size = recordings(), (SIZE, SIZE)
+        asked = drawn.take_tape(), drawn.channels, size, target, size, trained._loss_settings[1], True
+        loss, by_splats = compare(*asked)
+        made.append(recordings() - before)
+        rows = [by_splats.splats.x, by_splats.splats.a, by_splats.splats.opacity, *by_splats.features]
+        return [np.array(row) for row in (loss.value, *rows, by_splats.absolute_x)]
+
+    for count in (3200, 4000, 4900, 5000, 3300):
+        means = np.concatenate([rng.uniform(-0.6, 0.6, (400, 2)), rng.uniform(3, 4, (count - 400, 2))])
+        gaussians = model(np.column_stack([means, np.full(count, 2.0)]), 0.02, 0.5)
+        found, expected = (gradients(gaussians, way) for way in (trained._compare_at_once, trained._compare))
+        assert np.abs(expected[1]).max() > 0
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert len(capacities) == 1
+    assert made[::2] == [1, 0, 1, 0, 0], "one for each size of arrays"

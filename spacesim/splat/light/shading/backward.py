@@ -146,7 +146,7 @@ def _ways(
     for grad_logit in gradients.refine:
         assert config.refine is not None, "it was refined"
         assert tape.refine is not None, "it was refined"
-        encoding = inputs.sun.refine_encoding
+        encoding = inputs.sun.of_refinement
         ways.append(network.WayBack(config.refine.shape, refine_weights, tape.refine, encoding, grad_logit))
     return ways
 

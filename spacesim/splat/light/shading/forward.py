@@ -115,7 +115,7 @@ def is_painted(config: LightConfig, inputs: ShadingInputs) -> bool:
 def refine_layer(config: LightConfig, refine_weights: list[Float], inputs: ShadingInputs) -> network.InputLayer:
     """First layer of the refinement."""
     assert config.refine is not None, "there is one"
-    return mlp.make_input_layer(config.refine.shape, refine_weights, inputs.sun.refine_encoding)
+    return mlp.make_input_layer(config.refine.shape, refine_weights, inputs.sun.of_refinement)
 
 
 @recorded
@@ -214,7 +214,7 @@ def occlusion_and_tape(
     if not config.refine:
         return occlusion, None
     assert items is not None, "the refinement has inputs"
-    encoding = inputs.sun.refine_encoding
+    encoding = inputs.sun.of_refinement
     (logit,), tape = mlp.forward(config.refine.shape, refine_weights, items, encoding, launched=made)
     return [refine_occlusion(config.refine, occlusion[0], logit)], tape
 

@@ -20,6 +20,7 @@ from spacesim.splat.light.shadow.mapping import (
     LEAST_SOFTNESS,
     MappingConfig,
     MapReceivers,
+    map_records,
     occlusion_by_mapping,
     occlusion_in_map,
     project_casters,
@@ -38,6 +39,7 @@ from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import make_boxes, make_lists
 from spacesim.splat.raster.lists.boxes import Boxes, Grid
 from spacesim.splat.raster.lists.capacity import WAITING, Capacities, Extent, PairCounts
+from spacesim.splat.raster.lists.counting import picture_lists
 from spacesim.splat.raster.lists.tiles import TileLists
 from spacesim.splat.raster.project import Footprints, Splats
 
@@ -231,18 +233,22 @@ class _SunPicture:
 @recorded
 def _seen_by_sun(sunlit: _Sunlit, live: UInt32, most: int, grid: Grid) -> _SunPicture:
     """live: how many splats there are, `most` at most"""
-    rows, method = sunlit.rows, sunlit.method
-    camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.batch)
-    view = _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
+    rows, method, view = sunlit.rows, sunlit.method, _view_of(sunlit)
     if isinstance(method, MappingConfig):
-        splats, footprints = project_casters(rows, camera, method.antialiased)
+        splats, footprints = project_casters(rows, view.camera, method.antialiased)
         dr.schedule(view, splats, footprints)
     else:
         dr.eval(view)
         receivers = Receivers(view.bias.bias, view.points, method.beta_min)
-        splats, footprints = make_events(rows, receivers, camera, False, sunlit.batch)
+        splats, footprints = make_events(rows, receivers, view.camera, False, sunlit.batch)
         dr.schedule(splats, footprints)
     return _SunPicture(view, splats, footprints, make_boxes(splats, footprints, live, most, grid))
+
+
+def _view_of(sunlit: _Sunlit) -> _LightView:
+    rows = sunlit.rows
+    camera = fit_camera(Gaussians.from_rows(rows), sunlit.light, sunlit.size, sunlit.crop, sunlit.batch)
+    return _LightView(camera, *_receivers(rows, camera, sunlit.strength, sunlit.reach, sunlit.grazing))
 
 
 def _cast(sunlit: _Sunlit, seen: _SunPicture, limit: UInt32, capacities: Capacities, grid: Grid) -> Float:
@@ -252,12 +258,16 @@ def _cast(sunlit: _Sunlit, seen: _SunPicture, limit: UInt32, capacities: Capacit
 
 
 @recorded
-def _occlusion(sunlit: _Sunlit, view: _LightView, splats: Splats, lists: TileLists, capacity: int) -> Float:
-    """Occlusion [N] by the lists of the Sun's picture. capacity: length of the splats' arrays"""
+def _occlusion(
+    sunlit: _Sunlit, view: _LightView, splats: Splats | list[Float], lists: TileLists, capacity: int
+) -> Float:
+    """Occlusion [N] by the lists of the Sun's picture. splats: or, for mapping, `map_records`;  capacity: length of the
+    splats' arrays"""
     rows, method = sunlit.rows, sunlit.method
     if isinstance(method, MappingConfig):
         receivers = MapReceivers(rows, view.points, view.bias.bias, sunlit.softness)
         return occlusion_in_map(receivers, [], splats, lists, view.camera, method, capacity)
+    assert isinstance(splats, Splats), "events are their splats"
     return occlusion_in_events(splats, lists, (sunlit.size, sunlit.size), sunlit.batch, rows[0])
 
 
@@ -265,7 +275,15 @@ def _occlusion(sunlit: _Sunlit, view: _LightView, splats: Splats, lists: TileLis
 def _cast_at_once(
     sunlit: _Sunlit, live: UInt32, limit: UInt32, capacities: Capacities, grid: Grid
 ) -> tuple[_LightView, Float, UInt32 | UInt64]:
-    """`_seen_by_sun` and `_cast`; the `pair_ends` of the boxes."""
+    """`_seen_by_sun` and `_cast`; sums whose last says how many pairs there are. A map's lists have no slots, as those
+    of pictures."""
+    if isinstance(sunlit.method, MappingConfig):
+        view = _view_of(sunlit)
+        splats, footprints = project_casters(sunlit.rows, view.camera, sunlit.method.antialiased)
+        drawn = map_records(splats, sunlit.method, capacities.splats) or splats
+        dr.schedule(view, drawn)
+        lists, sums = picture_lists(splats, footprints, live, limit, capacities, grid)
+        return view, _occlusion(sunlit, view, drawn, lists, capacities.splats), sums
     seen = _seen_by_sun(sunlit, live, capacities.splats, grid)
     assert seen.boxes.pair_ends is not None
     return seen.view, _cast(sunlit, seen, limit, capacities, grid), seen.boxes.pair_ends

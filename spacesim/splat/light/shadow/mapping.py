@@ -16,12 +16,13 @@ from spacesim.backend.arrays import Array3f, Bool, Float, UInt32
 from spacesim.data.errors import InputError
 from spacesim.data.structure import check_fields
 from spacesim.splat.light.shadow.light_camera import drawable_mask
-from spacesim.splat.raster.blend import blend_lists
+from spacesim.splat.raster.blend import blend_lists, blend_packed
 from spacesim.splat.raster.cameras import Orthographic
 from spacesim.splat.raster.gaussians import Gaussians
 from spacesim.splat.raster.lists.bin import bin_splats
 from spacesim.splat.raster.lists.tiles import TileLists, round_capacity
 from spacesim.splat.raster.project import Footprints, Splats, project
+from spacesim.splat.raster.records import pack_records
 from spacesim.splat.raster.surface import NONE, depth_on_planes, depth_planes, walk
 
 Filter = Literal["bilinear", "percentage-closer", "variance", "median"]
@@ -122,29 +123,45 @@ class MapReceivers:
 def occlusion_in_map(
     test: MapReceivers,
     casting: list[Float],
-    splats: Splats,
+    splats: Splats | list[Float],
     lists: TileLists,
     camera: Orthographic,
     config: MappingConfig,
     capacity: int,
 ) -> Float:
     """[N]: draws the light's picture by its lists and looks the receivers up in it. casting: rows of what the splats
-    are; none: those of the receivers;  capacity: length of the splats' arrays"""
+    are; none: those of the receivers;  splats: or `map_records` of them;  capacity: length of the splats' arrays"""
     if config.filter == "median":
+        assert isinstance(splats, Splats), "they have no records"
         light = _median_shadow_map(Gaussians.from_rows(casting or test.rows), splats, lists, camera, capacity)
     else:
-        light = _mean_shadow_map(splats, lists, camera, config.filter == "variance", capacity)
+        light = _mean_shadow_map(splats, lists, camera, config, capacity)
     return _look_up(test, light, camera, config)
 
 
-def _mean_shadow_map(splats: Splats, lists: TileLists, camera: Orthographic, squares: bool, capacity: int) -> ShadowMap:
-    """What the Sun sees of the Gaussians, with the second moments of depth if `squares`."""
-    moments = [splats.depth, splats.depth * splats.depth] if squares else [splats.depth]
-    blended = blend_lists(splats, moments, lists, camera.width, camera.height, capacity)
+def map_records(splats: Splats, config: MappingConfig, capacity: int) -> list[Float]:
+    """Splats with the moments of depth that `_mean_shadow_map` blends, as `pack_records` packs them; nothing for the
+    filter "median"."""
+    return [] if config.filter == "median" else pack_records(splats, _moments(splats, config), capacity)
+
+
+def _moments(splats: Splats, config: MappingConfig) -> list[Float]:
+    return [splats.depth, splats.depth * splats.depth] if config.filter == "variance" else [splats.depth]
+
+
+def _mean_shadow_map(
+    splats: Splats | list[Float], lists: TileLists, camera: Orthographic, config: MappingConfig, capacity: int
+) -> ShadowMap:
+    """What the Sun sees of the Gaussians, with the second moments of depth for the filter "variance"."""
+    size, squares = (camera.width, camera.height), config.filter == "variance"
+    if isinstance(splats, Splats):
+        blended = blend_lists(splats, _moments(splats, config), lists, *size, capacity)
+    else:
+        blended = blend_packed(splats, 1 + squares, lists, *size, capacity)
     depth, *square = blended.features
     alpha = 1 - blended.transmittance
     dr.eval(alpha, depth, square)
-    return ShadowMap(alpha, depth, square[0] if squares else None, camera.width, camera.height)
+    return ShadowMap(alpha, depth, square[0] if squares else None, *size)
 
 
 _drawn = recorded(_mean_shadow_map)
@@ -219,7 +236,7 @@ class SunView:
         lists = bin_splats(splats, footprints, camera.width, camera.height)
         if lists.capacity == 0:
             return None
-        light = _drawn(splats, lists, camera, config.filter == "variance", round_capacity(dr.width(splats.x)))
+        light = _drawn(splats, lists, camera, config, round_capacity(dr.width(splats.x)))
         return SunView(light, camera, dr.opaque(ad.Float, max(softness, LEAST_SOFTNESS)), config)
 
     def visibility(self, points: Array3f) -> Float:

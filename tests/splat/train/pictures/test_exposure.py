@@ -120,7 +120,7 @@ def test_the_gradient_by_gains_is_that_of_the_loss(exposed):
 
     def loss():
         drawn = trainer._view_pass.forward(trainer.gaussians, rows, None, view, 0, 1, False)
-        return trainer._view_pass.loss(drawn, trainer._target_image(3, view, None), view.camera)
+        return trainer._view_pass.backward(drawn, trainer._target_image(3, view, None), view.camera, False)[0]
 
     gradient = exposures._by_numbers(0, np.array(loss().grad_gains, np.float64))
     for channel in range(3):

@@ -105,8 +105,8 @@ def test_the_loss_falls_as_the_gradient_says(small_dataset, known_gaussians):
         poses.numbers.values[0] = numbers
         view = trainer.pictures.shown(trainer.views[0])
         drawn = view_pass.forward(trainer.gaussians, rows, None, view, 0, 1, False)
-        found = view_pass.loss(drawn, trainer._target_image(5, view, None), view.camera)
-        grad_splats = view_pass.backward(drawn, found, absolute=False)
+        target = trainer._target_image(5, view, None)
+        found, grad_splats = view_pass.backward(drawn, target, view.camera, absolute=False)
         read = poses._gradient(rows[:11], drawn.camera, grad_splats.splats, [], poses._centre, False)
         return float(found.value[0]), poses._by_numbers(0, np.array(read, np.float64))
 
@@ -188,8 +188,8 @@ def test_disturbed_poses_come_back_before_a_model_that_is_right(small_dataset, k
     for step in range(40, 700):
         view = trainer.pictures.shown(trainer.views.at_step(step))
         drawn = trainer._view_pass.forward(trainer.gaussians, rows, None, view, 1, 1, False)
-        loss = trainer._view_pass.loss(drawn, trainer._target_image(step, view, None), view.camera)
-        grad_splats = trainer._view_pass.backward(drawn, loss, absolute=False)
+        target = trainer._target_image(step, view, None)
+        loss, grad_splats = trainer._view_pass.backward(drawn, target, view.camera, absolute=False)
         trainer.pictures.learn(step, view, rows, drawn, loss, grad_splats, trainer.scene_scale)
     after = off()
     assert after[0] < 0.2 * before[0]
