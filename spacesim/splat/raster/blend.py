@@ -255,6 +255,7 @@ def backward(
     """
     count, channels = dr.width(splats.x), len(feature_gradients)
     if lists.capacity == 0:
+        assert not dr.flag(dr.JitFlag.FreezingScope), "a recording would keep how many splats there are"
         zeros = [dr.opaque(ad.Float, 0, count) for _ in range(9 + channels)]  # no literals: they fold gradients away
         return SplatGradients(Splats(*zeros[:7]), zeros[9:], zeros[7], zeros[8])
     assert blended.state is not None, "blending has kept nothing for its adjoint"

@@ -202,10 +202,11 @@ class ViewPass:
     ) -> tuple[ViewLoss, SplatGradients]:
         """Loss of a view, and its gradients by splats and by what was blended. camera: of the target;  absolute: also
         what `watched` reads"""
-        compare = self._compare if is_usable() else self._compare_at_once  # kernels of text stand between recordings
+        tape, terms = drawn.take_tape(), self._loss_settings[drawn.downscale]
         blended, size = (drawn.camera.width, drawn.camera.height), (camera.width, camera.height)
-        terms = self._loss_settings[drawn.downscale]
-        return compare(drawn.take_tape(), drawn.channels, blended, target, size, terms, absolute)
+        # kernels of text stand between recordings, and gradients of nothing are as many as there are Gaussians
+        compare = self._compare if is_usable() or tape.lists.capacity == 0 else self._compare_at_once
+        return compare(tape, drawn.channels, blended, target, size, terms, absolute)
 
     def _compare(
         self,

@@ -115,3 +115,20 @@ def test_recordings_serve_any_number_of_gaussians(monkeypatch):
             np.testing.assert_array_equal(one, other)
     assert len(capacities) == 1
     assert made[::2] == [1, 0, 1, 0, 0], "one for each size of arrays"
+
+
+def test_a_picture_of_nothing_has_gradients_of_all_gaussians(monkeypatch):
+    """Their number changes between two visits of such a view."""
+    take_cudas(monkeypatch)
+    monkeypatch.setattr(view_pass, "is_usable", lambda: False)
+    rgba = np.full(SIZE * SIZE, 0xFF4080C0, np.uint32)
+    view = TrainingView(0, camera(), None, rgba, None, False, {})
+    target = TargetImage(upload(rgba, ad.UInt32), ad.Float([0.1, 0.2, 0.3]), ad.Bool(True), {})
+    trained = ViewPass(preset("fast"), scale=1.0)
+    for count in (30, 30, 40):
+        behind = model(np.tile([0, 0, -2.0], (count, 1)), 0.02, 0.5)
+        drawn = trained.forward(behind, behind.rows(), None, view, degree=0, downscale=1, watched=True)
+        loss, by_splats = trained.backward(drawn, target, camera(), absolute=True)
+        rows = [by_splats.splats.x, *by_splats.features, by_splats.absolute_x]
+        assert [np.array(row).tolist() for row in rows] == [[0.0] * count] * 5
+        assert float(loss.value[0]) > 0.1
